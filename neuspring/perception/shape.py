@@ -29,6 +29,7 @@ import trimesh
 import warp as wp
 from scipy import ndimage
 from scipy.sparse import coo_matrix, diags, identity
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -66,6 +67,13 @@ INLIERS = 0.85
 """Share of the nearest pairs that a step uses; the rest count as outliers."""
 BEND_REACH = 0.02
 """Largest distance, m, of a visible vertex from the cloud that it is moved onto."""
+MISFIT, LEAST_MISFIT = 0.035, 0.008
+"""RMS distance of the cloud from a placed mesh that is fine, as a part of the cloud's length, and at least, m. The surface of
+the demo's sloth has 0.018; a box, the sloth on a floor and the sloth beside a ball have 0.048 to 0.065."""
+LARGEST_RATIO, DEEPEST = 1.35, -0.03
+"""Length of a mesh over that of the cloud, and height of its lowest vertex, m, that are fine."""
+SEAM = 2e-5
+"""Corners nearer than this part of a mesh's length are one."""
 STIFFNESS = 5.0
 """Weight of smoothness against data in the last, non-rigid step."""
 
@@ -290,8 +298,22 @@ def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, setti
         raise InputError("perception.shape.mesh", "backend: mesh needs a file", "null", "Name a GLB, PLY or OBJ file.")
     vertices, faces = read_mesh(Path(settings.mesh))
     vertices, rms = place(vertices, faces, cloud)
+    require_fit(Path(settings.mesh), vertices, rms, cloud, capture.description.up_sign)
     vertices = bend(vertices, faces, capture, masks, cloud)
     return ShapePrior(vertices=vertices, faces=faces, backend="mesh", facts={"alignment_rms": rms})
+
+
+def require_fit(path: Path, vertices: np.ndarray, rms: float, cloud: np.ndarray, up: float) -> None:
+    """Raise InputError where a mesh, placed on the cloud [P, 3], m, at this RMS distance, is not the object's."""
+    size = float(np.ptp(cloud, axis=0).max())
+    ratio, lowest = float(np.ptp(vertices, axis=0).max()) / size, float((up * vertices[:, 2]).min())
+    if rms > max(LEAST_MISFIT, MISFIT * size) or ratio > LARGEST_RATIO or lowest < DEEPEST:
+        rule = f"the mesh must fit what was seen: RMS distance at most {1e3 * max(LEAST_MISFIT, MISFIT * size):.0f} mm, "
+        rule += f"at most {LARGEST_RATIO:g} times as long, at most {-1e3 * DEEPEST:.0f} mm below the table"
+        received = f"{1e3 * rms:.0f} mm, {ratio:.2f} times, {max(0.0, -1e3 * lowest):.0f} mm"
+        raise InputError(
+            path, rule, received, "Remove other bodies and floors from the file, or use perception.shape.backend: auto."
+        )
 
 
 def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
@@ -353,6 +375,9 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     if not Path(path).is_file():
         raise InputError(path, "this mesh must exist", "no such file")
+    if b"KHR_draco_mesh_compression" in path.read_bytes():
+        remedy = f"Unpack it: npx @gltf-transform/cli copy {path.name} unpacked.glb"
+        raise InputError(path, "a mesh without compression is required", "KHR_draco_mesh_compression", remedy)
     try:
         mesh = trimesh.load_mesh(path, process=True, maintain_order=False)
     except Exception as error:
@@ -368,7 +393,21 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(mesh.vertices).all():
         raise InputError(path, "every vertex must be finite", "a vertex that is not")
     if not mesh.is_watertight:
+        mesh = _without_seams(mesh)
+    if len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) < len(mesh.faces):
+        raise InputError(path, "each triangle must be there once", "some twice (double sided)", "Export one side.")
+    if not mesh.is_watertight:
         remedy = "Close it in a mesh editor; points are drawn inside it."
         raise InputError(path, "the surface must be closed", f"{len(mesh.faces)} triangles with open or branching edges", remedy)
     trimesh.repair.fix_normals(mesh)
     return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
+
+
+def _without_seams(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with corners that lie within SEAM of each other made one."""
+    pairs = cKDTree(mesh.vertices).query_pairs(SEAM * float(mesh.extents.max()), output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(mesh.vertices),) * 2)
+    _, first, group = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
+    joined = trimesh.Trimesh(mesh.vertices[first], group[mesh.faces], process=False)
+    joined.update_faces(joined.nondegenerate_faces())
+    return joined
