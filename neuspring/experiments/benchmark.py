@@ -20,6 +20,7 @@ from neuspring.baselines import BASELINES, REFERENCES
 from neuspring.config import Config, Method, ScenarioRow, SearchRow, merge, parse, plain
 from neuspring.config.parse import read_rows
 from neuspring.core.errors import InputError
+from neuspring.core.run_record import flat
 from neuspring.core.text import listed
 from neuspring.perception.backends import BACKENDS, require_known
 from neuspring.scenes.sources import SOURCES, Source, location, scenario_rows
@@ -215,6 +216,7 @@ class Benchmark:
         self.absent: InputError | None = None
         """All data that are not there."""
         self._check(plan_only)
+        self._check_effect(flat(values.get("fit") or {}))
 
     # --- the rows that the configuration names
 
@@ -297,6 +299,15 @@ class Benchmark:
         if not low <= wanted.low < wanted.high <= high:
             rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"
             raise InputError(f"method {name}, fit.stiffness_range", rule, [low, high])
+
+    def _check_effect(self, given: Mapping[str, Any]) -> None:
+        own = {name: flat(row.settings) for name, row in self.methods.items() if row.fit}
+        if own and (idle := [key for key in given if all(key in settings for settings in own.values())]):
+            rule, remedy = (
+                "must have an effect, and each method's row sets it",
+                f"Change it in a row of {self.config.method_table}.",
+            )
+            raise InputError(f"configuration, fit.{idle[0]}", rule, f"{given[idle[0]]} beside {', '.join(own)}", remedy)
 
     def _check_data(self, plan_only: bool) -> None:
         """Data that are absent are told of all scenarios at once, before anything else of their data."""

@@ -673,3 +673,11 @@ def test_an_oracle_has_a_fit_of_its_own_is_named_in_its_record_and_is_not_transf
     assert oracle.pop("options") == ours.pop("options") | {"oracle": True} and oracle == ours
     moved = {unit.name.split("/")[1] for unit in graph.runs() if any(step.stage.name == "transfer" for step in unit.steps)}
     assert moved == {"baseline", "neuspring"}
+
+
+def test_a_setting_that_every_method_sets_itself_is_refused():
+    values = shipped("toy") | {"methods": ["neuspring", "search_only"], "fit": {"epochs": 3, "output_bound": 2.0}}
+    with pytest.raises(
+        InputError, match=r"fit\.output_bound: must have an effect.* received 2\.0 beside neuspring\. Change it in a row"
+    ):
+        Benchmark(values, ROOT)
