@@ -29,6 +29,10 @@ def workflow_folder() -> Path:
 def workflow_command(data: str, *options: str, cores: int | None = None) -> list[str]:
     """The command that runs config/data/<data>.yaml on `cores` cores, all by default; `options` are Snakemake's."""
     root = workflow_folder()
+    if "--directory" not in options and not os.access(Path.cwd(), os.W_OK):
+        raise InputError(
+            Path.cwd(), "this folder must be writable, for Snakemake's state and results", None, "Call it from another one."
+        )
     # Commands that are told to go on with are this one with changes: in this folder they have its short names.
     root = Path() if root == Path.cwd() and "--directory" not in options else root
     count = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1
