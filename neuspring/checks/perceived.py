@@ -16,9 +16,6 @@ from neuspring.core.findings import Finding
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import LiftedTracks, ShapePrior
 
-WRONG = ("background in the mask", "mask flickers", "hands too large", "hands inside the object", "labels are noise")
-"""Findings of masks that cannot be right, by name: `perception.segment.verdict` decides what happens."""
-
 
 def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
     """Findings about labels [T, H, W] of one camera, with their `mask_facts`."""

@@ -74,8 +74,6 @@ class Segmentation(SettingsSection):
     marks.json, marks. marks: the capture's marks.json, carried through the video. grounded_sam2: GroundingDINO and SAM 2 (extra
     `perception`)."""
     grounded_sam2: GroundedSam2 = field(default_factory=GroundedSam2)
-    verdict: Literal["warn", "error"] = "warn"
-    """Consequence of masks that cannot be right: printed and recorded (warn), or a failure of the step (error)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 from neuspring.config import Config
-from neuspring.core.errors import InputError
 from neuspring.core.records import Recorder
 from neuspring.data.capture import Capture
 from neuspring.perception.backends import BACKENDS, backend_modules, segmentation, segmentation_keys
@@ -25,7 +24,7 @@ def _settled(rows: Rows) -> Config:
     output="{scenario}/perception/{camera}/masks.json",
     rule="perceive",
     when=lambda rows: rows.source.films or rows.images,
-    reads=lambda settings, given: (*segmentation_keys(settings.perception.segment.backend), "perception.segment.verdict"),
+    reads=lambda settings, given: segmentation_keys(settings.perception.segment.backend),
     code=lambda settings, given: backend_modules("segment", settings.perception.segment.backend),
     gpu=lambda settings: BACKENDS["segment"][settings.perception.segment.backend].gpu,
     memory_mb=8000,
@@ -35,22 +34,17 @@ def _settled(rows: Rows) -> Config:
 def segment(capture: Capture, camera: str, settings: Config, run: Recorder, device: str = "auto") -> Written:
     """One camera of a capture -> masks: masks.npz and masks.png."""
     from neuspring.checks.masks import mask_facts
-    from neuspring.checks.perceived import WRONG, look_at_masks
+    from neuspring.checks.perceived import look_at_masks
     from neuspring.core.findings import findings_as_facts
     from neuspring.data.frames import without_islands
     from neuspring.data.results import Masks
     from neuspring.perception import figures
 
-    section = settings.perception.segment
     capture.require_camera(camera)
-    backend = segmentation(section.backend, capture)
+    backend = segmentation(settings.perception.segment.backend, capture)
     labels = without_islands(capture, camera, BACKENDS["segment"][backend].segment(capture, camera, settings.perception, device))
     facts = mask_facts(capture, camera, labels)
     findings = look_at_masks(capture, camera, labels, facts)
-    wrong = [one for one in findings if one.name in WRONG]
-    if wrong and section.verdict == "error":
-        rule = "perception.segment.verdict: error asks for masks that can be right"
-        raise InputError(f"{capture.folder}, camera {camera}", rule, "; ".join(one.text for one in wrong))
     masks = Masks(labels=labels, backend=backend, facts=facts)
     files = run.beside(masks="masks.npz", picture="masks.png")
     masks.save(files["masks"])

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from neuspring import config
-from neuspring.config import page as config_page
+from tests.config import page as config_page
 
 ROOT = Path(__file__).parents[2]
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.skipif(not (ROOT / "neuspring" / "extensions").exists(), reason="the page has the settings of extensions")
 def test_the_configuration_page_is_up_to_date_and_complete():
     page = (ROOT / "config" / "README.md").read_text()
-    assert page == config_page.text(), "run: python -m neuspring.config.page"
+    assert page == config_page.text(), "run: python -m tests.config.page"
     assert "| . |\n" not in page  # every key has a meaning
     introduction, _, _ = page.partition("## Glossary")
     assert len(introduction.split()) <= 600

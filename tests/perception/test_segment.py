@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuspring.checks.masks import mask_facts
-from neuspring.checks.perceived import WRONG, look_at_masks
+from neuspring.checks.perceived import look_at_masks
 from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.frames import overlap
@@ -21,6 +21,9 @@ PIECES = 5
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     return film(tmp_path_factory.mktemp("film"), cameras=2, missing={1: (3,)})
+
+
+WRONG = ("background in the mask", "mask flickers", "hands too large", "hands inside the object", "labels are noise")
 
 
 def agreement(capture, labels, camera, frame, label):

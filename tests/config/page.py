@@ -1,4 +1,4 @@
-"""Write the tables of config/README.md from pydantic's schema of the settings: python -m neuspring.config.page"""
+"""Write the tables of config/README.md from pydantic's schema of the settings: python -m tests.config.page"""
 
 from __future__ import annotations
 
