@@ -275,6 +275,11 @@ class Benchmark:
         for name, method in self.methods.items():
             self._check_settings(name, method)
         require_known(self.config.perception)
+        shape = self.config.perception.shape
+        if shape.backend == "mesh" and shape.mesh:
+            from neuspring.perception.shape import read_mesh
+
+            read_mesh(Path(shape.mesh))
         self._check_data(plan_only)
         if not any(self.applies(method, scenario) for method in self.methods for scenario in self.config.scenarios):
             rule = "at least one method must apply to a scenario; what is trained on silhouettes needs images, a pool `pools`"

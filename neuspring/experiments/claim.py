@@ -16,7 +16,7 @@ from neuspring.core.job_records import FOLDER
 from neuspring.core.lock import try_lock
 from neuspring.core.records import now
 
-HELD: list[IO[str]] = []
+CLAIMS: list[IO[str]] = []
 """Open files: closing one would end its claim."""
 
 
@@ -37,7 +37,7 @@ def claim(results: Path, settings: str) -> None:
     file.truncate(0)
     json.dump({"pid": os.getpid(), "host": platform.node(), "since": now(), "settings": settings}, file)
     file.flush()
-    HELD.append(file)
+    CLAIMS.append(file)
 
 
 def _held(results: Path, path: Path, settings: str) -> InputError:

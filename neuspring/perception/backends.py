@@ -155,11 +155,7 @@ def segmentation(name: str, capture: Capture) -> str:
 
 
 def require_known(settings: Perception) -> None:
-    """Raise InputError, with the names that there are, where a configured backend is none of them, or a mesh cannot be read."""
-    if settings.shape.backend == "mesh" and settings.shape.mesh:
-        from neuspring.perception.shape import read_mesh
-
-        read_mesh(Path(settings.shape.mesh))
+    """Raise InputError, with the names that there are, where a configured backend is none of them."""
     for step, name in (("segment", settings.segment.backend), ("track", settings.track.backend)):
         if name not in BACKENDS[step]:
             remedy = "Restore the folder of its extension." if name in BACKENDS[step].left_out else ""

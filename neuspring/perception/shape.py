@@ -70,7 +70,7 @@ BEND_REACH = 0.02
 MISFIT, LEAST_MISFIT = 0.035, 0.008
 """RMS distance of the cloud from a placed mesh that is fine, as a part of the cloud's length, and at least, m. The surface of
 the demo's sloth has 0.018; a box, the sloth on a floor and the sloth beside a ball have 0.048 to 0.065."""
-LARGEST_RATIO, DEEPEST = 1.35, -0.03
+LARGEST_RATIO, LOWEST_VERTEX = 1.35, -0.03
 """Length of a mesh over that of the cloud, and height of its lowest vertex, m, that are fine."""
 SEAM = 2e-5
 """Corners nearer than this part of a mesh's length are one."""
@@ -307,9 +307,9 @@ def require_fit(path: Path, vertices: np.ndarray, rms: float, cloud: np.ndarray,
     """Raise InputError where a mesh, placed on the cloud [P, 3], m, at this RMS distance, is not the object's."""
     size = float(np.ptp(cloud, axis=0).max())
     ratio, lowest = float(np.ptp(vertices, axis=0).max()) / size, float((up * vertices[:, 2]).min())
-    if rms > max(LEAST_MISFIT, MISFIT * size) or ratio > LARGEST_RATIO or lowest < DEEPEST:
+    if rms > max(LEAST_MISFIT, MISFIT * size) or ratio > LARGEST_RATIO or lowest < LOWEST_VERTEX:
         rule = f"the mesh must fit what was seen: RMS distance at most {1e3 * max(LEAST_MISFIT, MISFIT * size):.0f} mm, "
-        rule += f"at most {LARGEST_RATIO:g} times as long, at most {-1e3 * DEEPEST:.0f} mm below the table"
+        rule += f"at most {LARGEST_RATIO:g} times as long, at most {-1e3 * LOWEST_VERTEX:.0f} mm below the table"
         received = f"{1e3 * rms:.0f} mm, {ratio:.2f} times, {max(0.0, -1e3 * lowest):.0f} mm"
         raise InputError(
             path, rule, received, "Remove other bodies and floors from the file, or use perception.shape.backend: auto."

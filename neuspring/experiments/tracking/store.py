@@ -35,7 +35,7 @@ ENVIRONMENT = {
 and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
 DATABASE_RETRIES = 2
 """In place of MLflow's ten, which take two minutes where nobody is at the address."""
-ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"
+ARTIFACTS, INDEX = "mlartifacts", "mlflow.db"
 REASONS = {
     "disk is full": "no space left on the disk of {results}; free some, then run `neuspring sync`",
     "no space left": "no space left on the disk of {results}; free some, then run `neuspring sync`",
@@ -57,7 +57,7 @@ LOCK_PATIENCE = 600.0
 
 def default_uri(results: Path) -> str:
     """The tracking URI of a results folder that has no server: a SQLite file in it."""
-    return f"sqlite:///{Path(results).resolve() / DATABASE}"
+    return f"sqlite:///{Path(results).resolve() / INDEX}"
 
 
 def lock(results: Path, name: str) -> BaseFileLock:
@@ -96,7 +96,7 @@ def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
 
 def _keep_moved(results: Path, experiment: str, location: str) -> None:
     """Rename the index of a results folder that was moved or copied: it holds places of artifacts, and perhaps tags and notes."""
-    database = results / DATABASE
+    database = results / INDEX
     with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as db:
         rows = db.execute("SELECT artifact_location FROM experiments WHERE name = ?", [experiment]).fetchall()
         if rows and rows[0][0] != location:
@@ -111,7 +111,7 @@ def explained(error: Exception, results: Path, settings: Tracking) -> str:
     if settings.uri is not None:
         return line
     reason = next((words for part, words in REASONS.items() if part in line.lower()), "")
-    return reason.format(results=results) or f"{line} (if that stays, rename {results}/{DATABASE}; `neuspring sync` makes another)"
+    return reason.format(results=results) or f"{line} (if that stays, rename {results}/{INDEX}; `neuspring sync` makes another)"
 
 
 def _count_rows(database: Path) -> None:
@@ -151,7 +151,7 @@ def page(results: Path, settings: Tracking) -> tuple[str, bool]:
         client, experiment = connect(results, settings)
         client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{VIEW}", json.dumps(_view()))
         if settings.uri is None:
-            _count_rows(Path(results).resolve() / DATABASE)
+            _count_rows(Path(results).resolve() / INDEX)
     except Exception as error:
         uri = masked(settings.uri or default_uri(results))
         raise InputError(uri, "MLflow must be able to open it", explained(error, results, settings)) from error
