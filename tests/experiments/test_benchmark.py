@@ -29,6 +29,9 @@ from tests.support.colored import paint
 from tests.support.extensions import with_extensions
 from tests.support.project import config_with
 
+# The configurations that are shipped name rows and sources of extensions.
+pytestmark = with_extensions
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -419,11 +422,7 @@ STUDIES = {
 
 @pytest.mark.parametrize(
     ("data", "studies"),
-    [
-        pytest.param(data, text, marks=[with_extensions] if text == "baselines" or data in ("demo", "synthetic") else [])
-        for data, texts in STUDIES.items()
-        for text in texts
-    ],
+    [(data, text) for data, texts in STUDIES.items() for text in texts],
 )
 def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
     values = shipped(data, *studies.split())
@@ -489,12 +488,11 @@ def test_studies_bring_the_methods_of_their_rows_in_the_order_of_the_table():
     assert Benchmark(some | {"methods": []}, ROOT).whole.methods == ("neuspring", "no_triplane", "fixed_resolution")
 
 
-@with_extensions
 @pytest.mark.parametrize("overlays", [["synthetic"], ["synthetic", "paper"]], ids="-".join)
 @pytest.mark.parametrize(
     ("study", "runs", "searches", "fits", "trainings"),
     [
-        pytest.param("table1", 24, 12, 12, 12, marks=with_extensions),
+        pytest.param("table1", 24, 12, 12, 12),
         ("table2", 24, 12, 24, 0),
         ("table2_ours", 24, 12, 24, 0),
         ("table3", 18, 6, 18, 0),
