@@ -14,6 +14,7 @@ from neuspring.core import provenance
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph
 from neuspring.stages import STAGES
+from tests.support.extensions import with_extensions
 
 PACKAGE = Path(provenance.__file__).parents[1]
 ROOT = PACKAGE.parent
@@ -74,6 +75,7 @@ def test_code_counts_where_it_is_used_and_nowhere_else(copy, file, old, new, sta
     assert [name for name in before if digest(f"neuspring.stages.{name}") != before[name]] == [stage]
 
 
+@with_extensions
 def test_modules_that_are_imported_by_name_count(copy):
     """Backends, readers and baselines: the registries name them, and the workflow adds them to the stage that uses them."""
     values = config.read_yaml(ROOT / "config" / "config.yaml")
