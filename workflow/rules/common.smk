@@ -147,6 +147,6 @@ def needed_by(rule):
         return attempt * (sum(one.minutes for one in stages(wildcards)) or RULES[rule])
 
     resources = {"mem_mb": memory, "runtime": minutes}
-    if any(one.gpu for one in STAGES_OF.get(rule, [])) or rule == "tune":
+    if any(one.gpu for one in STAGES_OF.get(rule, [])) or "tune" == rule:
         resources["gpu"] = lambda wildcards: jobs()[0].gpus(unit_of(rule, wildcards))
     return resources
