@@ -5,6 +5,8 @@ import pickle
 
 import numpy as np
 
+from neuspring.data.unpickle import load_pickle
+
 WIDTH, HEIGHT = 64, 48
 
 
@@ -80,7 +82,7 @@ def write_json(path, value):
 def edit(folder, **changes):
     """Replace keys of final_data.pkl (None removes a key)."""
     path = folder / "final_data.pkl"
-    data = pickle.loads(path.read_bytes())
+    data = load_pickle(path)
     for key, value in changes.items():
         if value is None:
             del data[key]
@@ -91,5 +93,4 @@ def edit(folder, **changes):
 
 def stored(folder):
     """The arrays of final_data.pkl."""
-    data = pickle.loads((folder / "final_data.pkl").read_bytes())
-    return data
+    return load_pickle(folder / "final_data.pkl")
