@@ -11,6 +11,7 @@ import errno
 import os
 import platform
 import resource
+import signal
 import sys
 import time
 import traceback
@@ -59,6 +60,8 @@ def run(
     """Run a job of the configuration `values`; ends the process with status 2 for bad input, 1 for another error."""
     graph = Graph(with_gpus(Benchmark(values, root)))
     Tasks(graph, commands, sweeps)
+    # Files are replaced as a whole, so that a job may end anywhere: it does not wait for a kernel's end.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     folder = Path(graph.results) / FOLDER / rule / name
     with logged(folder / f"{digest}.log") as say, alone(folder, say):
         own = Runner(graph, folder / f"{digest}.log", threads)

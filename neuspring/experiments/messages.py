@@ -6,10 +6,12 @@ import contextlib
 import json
 import shlex
 import shutil
+import signal
 import sys
 import time
 from datetime import datetime
 from pathlib import Path
+from types import FrameType
 
 from neuspring.config import plain
 from neuspring.core.errors import InputError
@@ -27,6 +29,8 @@ LITTLE = 2_000_000
 """Bytes; with less a disk counts as full."""
 MOST_FINDINGS = 20
 """Warnings that are printed at the end of a run."""
+INTERRUPTS: list[int] = []
+"""Signals with which the user has ended this run."""
 
 
 def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: bool) -> None:
@@ -37,6 +41,12 @@ def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: b
         raise InputError("--cores", reason, cores, "Leave it out; --jobs limits how many jobs there are at once.")
     config = graph.config
     claim(Path(config.results), digest_of(plain(config)))
+
+    def interrupt(signal_: int, frame: FrameType | None) -> None:
+        INTERRUPTS.append(signal_)
+        signal.default_int_handler(signal_, frame)
+
+    signal.signal(signal.SIGINT, interrupt)
     (Path(config.results) / FOLDER / NOTES).unlink(missing_ok=True)
     chosen = {name: list(getattr(config, name)) for name in ("scenarios", "methods", "seeds")}
     keep_asked(
@@ -47,6 +57,10 @@ def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: b
 def failed(graph: Graph, tasks: Tasks, begun: float) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
     results = Path(graph.config.results)
+    if INTERRUPTS:
+        done = sum(1 for job in read_jobs(results, damaged=[]) if job.outcome == "finished")
+        print(f"\nInterrupted. {done} finished jobs are kept in {results}. Rerun the same command to resume.", flush=True)
+        return
     if shutil.disk_usage(results).free < LITTLE:
         print(f"\n{results}: no space left on the disk. Free some space; the same command continues.", flush=True)
         return

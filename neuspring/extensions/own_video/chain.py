@@ -12,8 +12,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from neuspring.config.parse import read_yaml
 from neuspring.core.errors import InputError
@@ -27,7 +30,13 @@ from neuspring.extensions.own_video.options import Wish
 StepRun = Callable[[list[str], Path], int]
 TWIN_STEPS = ("capture", "masks", "check", "twin")
 STEPS_DONE = "steps.json"
-"""Step -> its command, once it has succeeded; `window`: the frames that were chosen."""
+"""Step -> its command, once it has succeeded; `window`: the frames that were chosen; `options`: those of finished steps."""
+STEP_OPTIONS = {
+    "capture": ("film", "category", "mass", "frames", "intake"),
+    "masks": ("masks", "hands", "marks"),
+    "twin": ("effort", "method"),
+}
+"""Step -> options of `neuspring twin` that decide what it makes."""
 PROPOSED = re.compile(r"--frames (\d+-\d+)")
 """The longest constant grip, which `check-data` proposes first."""
 WINDOW = re.compile(r"all|\d+-\d+")
@@ -47,9 +56,16 @@ class TwinChain:
     """The steps of one wish. Raises InputError for what cannot be, before anything is run or written."""
 
     def __init__(self, wish: Wish) -> None:
-        self.wish, film = wish, wish.film
+        film = wish.film
         if not film.exists():
             raise InputError(film, "a folder of color and depth, a recording, a video or a capture is required", "nothing there")
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", film.resolve().stem if film.is_file() else film.resolve().name).strip("._-")
+        self.folder = (wish.output or Path("twins") / name).resolve()
+        record = self.folder / STEPS_DONE
+        self.done: dict[str, Any] = load_json(record) if record.is_file() else {}
+        places = {name: tuple(map(Path.resolve, getattr(wish, name))) for name in ("masks", "hands")}
+        wish = replace(wish, film=film.resolve(), marks=wish.marks and wish.marks.resolve(), **places)
+        self.wish = wish = self._with_earlier_options(wish)
         if wish.mass is not None and not 0 < wish.mass < math.inf:
             raise InputError("--mass", "must be a positive number of kg", wish.mass)
         _require_window("--window", wish.window or "all")
@@ -60,12 +76,25 @@ class TwinChain:
         if self.given and any((wish.mass, wish.frames, wish.intake)):
             rule = "--mass, --frames and --intake make a capture, and this is one"
             raise InputError(film, rule, CAPTURE, f'Write "mass" into {CAPTURE}; keep frames with --window.')
-        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", film.resolve().stem if film.is_file() else film.resolve().name).strip("._-")
-        self.folder = (wish.output or Path("twins") / name).resolve()
         self.capture = film.resolve() if self.given else self.folder / "captures" / self.folder.name
         self.method = wish.method or str(read_yaml(workflow_folder() / "config" / "data" / "own.yaml")["methods"][-1])
-        record = self.folder / STEPS_DONE
-        self.done: dict[str, list[str]] = load_json(record) if record.is_file() else {}
+
+    def _with_earlier_options(self, wish: Wish) -> Wish:
+        """Options that are not given are those of the earlier call. Raises InputError where a capture was made with others."""
+        earlier = TypeAdapter(Wish).validate_python({"film": wish.film, **self.done.get("options", {})})
+        changed = {one.name for one in fields(Wish) if getattr(wish, one.name) not in (one.default, getattr(earlier, one.name))}
+        taken = {
+            name: getattr(earlier, name)
+            for name in self.done.get("options", {})
+            if name not in changed and getattr(wish, name) != getattr(earlier, name)
+        }
+        if taken:
+            print("Options of the earlier call: " + ", ".join(_option(*one) for one in taken.items()))
+        if "capture" in self.done and (other := [name for name in STEP_OPTIONS["capture"] if name in changed]):
+            was, now = (", ".join(_option(name, getattr(one, name)) for name in other) for one in (earlier, wish))
+            remedy = "Leave these options out, choose another --output, or delete this folder."
+            raise InputError(self.folder, f"its capture was made with {was}", now, remedy)
+        return replace(wish, **taken)
 
     def run(self) -> int:
         """Do what is not done yet; returns the exit status."""
@@ -87,19 +116,16 @@ class TwinChain:
         for name in ("mass", "frames"):
             words += [f"--{name}", str(getattr(wish, name))] if getattr(wish, name) else []
         command = _neuspring("make-capture", *words, *shlex.split(wish.intake))
-        # The words behind `python -m neuspring`: the same step in another environment is the same step.
-        if made and (before := self.done.get("capture", command))[3:] != command[3:]:
-            remedy = "Choose another --output, or delete that folder."
-            raise InputError(self.capture, f"was made by: {shlex.join(before)}", shlex.join(command), remedy)
         self._step("capture", command, made)
 
     def _masks(self) -> None:
         wish = self.wish
-        words = ["--marks", str(wish.marks.resolve())] if wish.marks else []
+        words = ["--marks", str(wish.marks)] if wish.marks else []
         for name, paths in (("--masks", wish.masks), ("--hands", wish.hands)):
-            words += [name, *(str(path.resolve()) for path in paths)] if paths else []
+            words += [name, *map(str, paths)] if paths else []
         command = _neuspring("mask", str(self.capture), *words)
         if words:
+            # The words behind `python -m neuspring`: the same step in another environment is the same step.
             self._step("masks", command, self._masked() and self.done.get("masks", [])[3:] == command[3:])
         elif self._masked():
             self._say("masks", "they are in the capture")
@@ -188,6 +214,8 @@ class TwinChain:
     def _keep(self, name: str, words: list[str]) -> None:
         if not self.wish.dry_run:
             self.done[name] = words
+            kept = TypeAdapter(Wish).dump_python(self.wish, mode="json", include=set(STEP_OPTIONS.get(name, ())))
+            self.done["options"] = self.done.get("options", {}) | kept
             write_text(self.folder / STEPS_DONE, json.dumps(self.done, indent=1) + "\n")
 
     def _tell(self, scenario: Path) -> int:
@@ -241,6 +269,11 @@ def _run(command: list[str], log: Path) -> int:
             follow()
             raise
     return process.returncode
+
+
+def _option(name: str, value: Any) -> str:
+    words = value if isinstance(value, tuple) else (value,)
+    return f"--{name} {shlex.join(map(str, words))}" if value else f"no --{name}"
 
 
 def _require_window(where: str, text: str) -> None:

@@ -100,7 +100,17 @@ def test_a_second_call_does_what_is_left(film, steps, capsys):
     assert steps.names == ["check-data", "--snakefile"], "the workflow passes over what it has"
     steps.ran = []
     assert with_masks(film, "--mass", "2") == 2
-    assert "was made by: " in capsys.readouterr().err and not steps.ran
+    assert "its capture was made with no --mass; received --mass 2.0. Leave" in capsys.readouterr().err and not steps.ran
+
+
+def test_a_second_call_takes_options_from_the_first(film, steps, capsys):
+    assert with_masks(film, "--mass", "0.3", "--effort", "paper") == 0
+    steps.ran = []
+    assert twin(film, "--category", "object") == 0
+    assert "effort=paper" in steps.ran[-1]
+    assert f"--mass 0.3, --masks '{film / 'masks'}', --effort paper" in capsys.readouterr().out
+    assert twin(film, "--effort", "quick", "--category", "rope") == 2
+    assert "made with --category object; received --category rope" in capsys.readouterr().err
 
 
 def test_the_longest_constant_grip_is_taken_or_another_window(film, steps, capsys, monkeypatch):
