@@ -26,13 +26,18 @@ def workflow_folder() -> Path:
     raise InputError("workflow", "the package must have its Snakefile", "none", "Use a checkout, or install it from one.")
 
 
+def require_writable() -> None:
+    """Raises InputError where Snakemake cannot keep its state in the current folder."""
+    if not os.access(Path.cwd(), os.W_OK):
+        remedy = "Start it in another folder, or name one with Snakemake's --directory."
+        raise InputError(Path.cwd(), "this folder must be writable, for Snakemake's state and results", None, remedy)
+
+
 def workflow_command(data: str, *options: str, cores: int | None = None) -> list[str]:
     """The command that runs config/data/<data>.yaml on `cores` cores, all by default; `options` are Snakemake's."""
     root = workflow_folder()
-    if "--directory" not in options and not os.access(Path.cwd(), os.W_OK):
-        raise InputError(
-            Path.cwd(), "this folder must be writable, for Snakemake's state and results", None, "Call it from another one."
-        )
+    if "--directory" not in options:
+        require_writable()
     # Commands that are told to go on with are this one with changes: in this folder they have its short names.
     root = Path() if root == Path.cwd() and "--directory" not in options else root
     count = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1

@@ -7,8 +7,10 @@ import os
 import re
 import socket
 import sqlite3
+import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -303,7 +305,8 @@ def test_telemetry_is_off_before_mlflow_is_imported_and_the_users_values_stay(tm
 def test_the_pages_are_served_by_one_process_on_this_machine_alone(results, monkeypatch):
     tracking.log_run(write_run(results), results, SETTINGS)
     asked = []
-    monkeypatch.setattr(os, "execve", lambda program, words, environment: asked.append(words))
+    ended = SimpleNamespace(poll=lambda: 0, wait=lambda: 0)
+    monkeypatch.setattr(subprocess, "Popen", lambda words, env: asked.append(words) or ended)
     ui(results, port=free_port())
     (words,) = asked
     given = dict(zip(words[4::2], words[5::2], strict=True))

@@ -9,7 +9,7 @@ from neuspring import config as settings
 from neuspring.cli.main import COMMANDS
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import FOLDER
-from neuspring.experiments import gpus, job, messages, plan
+from neuspring.experiments import gpus, job, local, messages, plan
 from neuspring.experiments.benchmark import checked, for_targets
 from neuspring.experiments.graph import Graph
 from neuspring.experiments.tasks import RULES, Tasks
@@ -37,6 +37,7 @@ def or_workflow_error(check, *arguments, **named):
         raise WorkflowError(str(error)) from None
 
 
+or_workflow_error(local.require_writable)
 settings.merge(config, settings.of_command_line(workflow.config_settings.config))
 DRY = workflow.output_settings.dryrun
 BENCHMARK = or_workflow_error(checked, config, ROOT, plan_only=DRY)
