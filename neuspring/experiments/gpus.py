@@ -25,6 +25,8 @@ from neuspring.core.errors import InputError
 from neuspring.core.lock import try_lock, wait_for_lock
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
+DEVICE = re.compile(r"\d+$|GPU-|MIG-")
+"""What it calls a device."""
 LOCKS = "NEUSPRING_GPU_LOCKS"
 """Environment: the folder of the slots. Users who share GPUs set it to one folder that all of them can write to."""
 SLOT_POLL = 0.05
@@ -175,7 +177,8 @@ def nvml() -> Iterator[Any]:
 def visible_devices(environment: Mapping[str, str] = os.environ) -> tuple[str, ...]:
     """The GPUs that may be used: those of CUDA_VISIBLE_DEVICES, else all of this machine, as CUDA_VISIBLE_DEVICES takes them."""
     if VISIBLE in environment:
-        return tuple(name.strip() for name in environment[VISIBLE].split(",") if name.strip() not in ("", "-1"))
+        # As CUDA does, up to the first entry that names no device: -1, nothing, or Slurm's NoDevFiles.
+        return tuple(itertools.takewhile(DEVICE.match, map(str.strip, environment[VISIBLE].split(","))))
     with nvml() as library:
         return tuple(map(str, range(library.nvmlDeviceGetCount()))) if library else ()
 

@@ -96,8 +96,8 @@ def test_a_job_gets_all_its_devices_or_holds_none(tmp_path):
 
 def test_the_devices_that_the_user_allows_are_the_pool():
     assert gpus.visible_devices({gpus.VISIBLE: "2, GPU-1a"}) == ("2", "GPU-1a")
-    assert gpus.visible_devices({gpus.VISIBLE: ""}) == ()
-    assert gpus.visible_devices({gpus.VISIBLE: "-1"}) == ()
+    assert gpus.visible_devices({gpus.VISIBLE: "MIG-2b,0,-1,1"}) == ("MIG-2b", "0")
+    assert all(gpus.visible_devices({gpus.VISIBLE: none}) == () for none in ("", "-1", "NoDevFiles"))
 
 
 @pytest.fixture
