@@ -58,7 +58,7 @@ def failed(graph: Graph, tasks: Tasks, begun: float) -> None:
     """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
     results = Path(graph.config.results)
     if INTERRUPTS:
-        done = sum(1 for job in read_jobs(results, damaged=[]) if job.outcome == "finished")
+        done = sum(not job.failed for job in read_jobs(results, damaged=[]))
         print(f"\nInterrupted. {done} finished jobs are kept in {results}. Rerun the same command to resume.", flush=True)
         return
     if shutil.disk_usage(results).free < LITTLE:

@@ -16,7 +16,7 @@ import pytest
 from tests.support.project import PATIENCE, arguments, copy_workflow, environment, output_of, plan, run, start
 
 SCENES = ["toy_rope_lift_smooth", "toy_rope_shake_smooth", "toy_rope_lift_two_region"]
-CHANGES = {"scenarios": SCENES, "methods": ["search_only", "baseline", "neuspring"], "tracking": {"enabled": False}}
+CHANGES = {"scenarios": SCENES, "methods": ["static", "search_only", "baseline"], "tracking": {"enabled": False}}
 DISK = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
 """A shell whose mounts are its own."""
 pytestmark = pytest.mark.slow
@@ -83,11 +83,11 @@ def test_a_run_that_is_disturbed_in_every_way_ends_with_the_table_of_an_undistur
     undisturbed, project = (copy_workflow(tmp_path / name) for name in ("undisturbed", "disturbed"))
     run(undisturbed, CHANGES)
     draw = random.Random(0)
-    # A disk of 20 kB holds no observations.
+    # A disk of 4 kB holds no observations.
     if subprocess.run([*DISK, "true"], capture_output=True).returncode == 0:
         small = project / "results" / SCENES[0]
         small.mkdir(parents=True)
-        command = f'mount -t tmpfs -o size=20k tmpfs "{small}" && exec "$@"'
+        command = f'mount -t tmpfs -o size=4k tmpfs "{small}" && exec "$@"'
         output = output_of(start([*DISK, command, "sh", *arguments(project, CHANGES, "--until", "perceive")], project), fails=True)
         assert "no space left" in output and "Traceback" not in output
     for _ in range(7):

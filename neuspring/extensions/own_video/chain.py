@@ -63,8 +63,8 @@ class TwinChain:
         self.folder = (wish.output or Path("twins") / name).resolve()
         record = self.folder / STEPS_DONE
         self.done: dict[str, Any] = load_json(record) if record.is_file() else {}
-        places = {name: tuple(map(Path.resolve, getattr(wish, name))) for name in ("masks", "hands")}
-        wish = replace(wish, film=film.resolve(), marks=wish.marks and wish.marks.resolve(), **places)
+        masks, hands = (tuple(map(Path.resolve, paths)) for paths in (wish.masks, wish.hands))
+        wish = replace(wish, film=film.resolve(), masks=masks, hands=hands, marks=wish.marks and wish.marks.resolve())
         self.wish = wish = self._with_earlier_options(wish)
         if wish.mass is not None and not 0 < wish.mass < math.inf:
             raise InputError("--mass", "must be a positive number of kg", wish.mass)
