@@ -64,7 +64,7 @@ def kill(project, draw, *, whole):
     """Run, and kill all processes, or the jobs alone, at a random moment."""
     process = quietly(project)
     at_work(process)
-    time.sleep(draw.uniform(0, 4))
+    time.sleep(draw.uniform(0, 8))
     if whole:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
