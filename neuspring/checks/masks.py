@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from neuspring.checks.timing import small
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, gray, spread
 
@@ -77,7 +78,9 @@ class Shown:
     def ratios(self) -> dict[int, float]:
         """Ratio of the object's areas, 1 or more, in a frame and the one before it; of frames that follow each other."""
         grown = self.areas[OBJECT] + AREA_FLOOR * self.size[0] * self.size[1]
-        return {b: float(max(grown[a] / grown[b], grown[b] / grown[a])) for a, b in pairwise(self.frames.tolist()) if b == a + 1}
+        # A mask that begins is no jump.
+        begun = [frame for frame in self.frames.tolist() if np.nansum(self.areas[OBJECT, : frame + 1])]
+        return {b: float(max(grown[a] / grown[b], grown[b] / grown[a])) for a, b in pairwise(begun) if b == a + 1}
 
     @property
     def steps(self) -> float:
@@ -132,8 +135,8 @@ FLICKER_PAIRS = 16
 """Number of pairs of frames that are looked at for pixels that change their label alone."""
 LAG, LOOKED = 3, 24
 """Frames between two pictures that are compared, and number of such pairs."""
-COMPARED_WIDTH, COLOR_MOVED = 320, 12
-"""Width, pixels, at which they are compared, and the change of a color value from which a pixel moves."""
+COLOR_MOVED = 12
+"""Change of a color value from which a pixel moves."""
 MASK_RIM, MOTION_BESIDE = 0.01, 0.075
 """Part of the width by which a mask may be too small, and beside an object within which motion belongs to it or to a hand."""
 OUTSIDE = 0.25
@@ -150,7 +153,7 @@ ratios of its three colors may differ."""
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The change of a camera's picture from a frame on, at COMPARED_WIDTH pixels."""
+    """The change of a camera's picture from a frame on, at WATCHED_WIDE pixels."""
 
     frame: int
     moving: np.ndarray
@@ -198,28 +201,26 @@ class Motion:
 
 def motions(capture: Capture, camera: str, labels: np.ndarray) -> Iterator[Motion]:
     """At most LOOKED of them, evenly spread."""
-    frames, view = frames_of(capture, camera), capture.cameras[camera]
-    scale = min(1.0, COMPARED_WIDTH / view.width)
-    size = round(scale * view.width), round(scale * view.height)
-
-    def small(frame: int) -> np.ndarray:
-        image = cv2.resize(np.ascontiguousarray(capture.color(camera, frame)), size, interpolation=cv2.INTER_AREA)
-        return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+    frames = frames_of(capture, camera)
 
     def change(one: np.ndarray, other: np.ndarray, least: float) -> np.ndarray:
         changed = (np.abs(one - other).max(axis=-1) > least).astype(np.uint8)
         return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(bool)
 
-    pairs = [(here, there) for here, there in zip(frames, frames[LAG:], strict=False) if there - here == LAG]
+    pairs = [
+        (here, there)
+        for here, there in zip(frames, frames[LAG:], strict=False)
+        if there - here == LAG and capture.shows(camera, here)
+    ]
     if not pairs:
         return
-    first = small(frames[0])
+    first = small(capture.color(camera, frames[0]))
     for here, there in spread(pairs, LOOKED):
-        image = small(here)
-        three = [cv2.resize(labels[k], size, interpolation=cv2.INTER_NEAREST) for k in (here, there, frames[0])]
+        image, later = (small(capture.color(camera, frame)) for frame in (here, there))
+        three = [cv2.resize(labels[k], first.shape[1::-1], interpolation=cv2.INTER_NEAREST) for k in (here, there, frames[0])]
         ratio = np.log((image + 8) / (first + 8))
         shaded = (ratio.max(axis=-1) < DARKER) & (np.ptp(ratio, axis=-1) < SHADOW_TINT)
-        yield Motion(here, change(image, small(there), COLOR_MOVED), change(image, first, 2 * COLOR_MOVED), shaded, np.stack(three))
+        yield Motion(here, change(image, later, COLOR_MOVED), change(image, first, 2 * COLOR_MOVED), shaded, np.stack(three))
 
 
 def grown(mask: np.ndarray, share: float) -> np.ndarray:

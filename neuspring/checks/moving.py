@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from neuspring.core.text import listed
+from neuspring.core.text import listed, spans
 
 AROUND = 4
 """Frames before and after a step with which it is compared; up to two more large steps there do not hide it."""
@@ -27,8 +27,10 @@ LEAST, SLOW = 0.01, 0.5
 """m and m/s: smaller and slower steps may be noise."""
 HELD = 4
 """Frames from which a place that stays equal to the bit is looked at."""
-EXCHANGED = 0.5
-"""Steps after an exchange of labels, as a part of those before it, that show that they were exchanged."""
+EXCHANGED, OFTEN = 0.5, 0.1
+"""Steps after an exchange of labels, as a part of those before it, that show that they were exchanged; and the part of the frames
+with an exchange from which points have no order."""
+ORDER = "Write each point at the same index in all frames, or leave the frames out."
 MAX_STRETCH = 0.5
 """Change of the distance of two neighbors, as a fraction of it, by which one of them left the other."""
 MANY = 4
@@ -121,26 +123,26 @@ class Moving:
         return bool(run[0] and went[other] > max(LEAST, MAX_STRETCH * near[other]))
 
     @cached_property
-    def swapped(self) -> dict[tuple[int, ...], list[int]]:
-        """Points that exchange their places -> the frames in which they do."""
-        doubtful = (self.away > LEAST) & ((self.speed > HELD_STEP * self.around) | (self.gap > 1))
-        found: dict[tuple[int, ...], list[int]] = {}
-        for frame in np.flatnonzero(doubtful.sum(axis=1) > 1):
-            some = np.flatnonzero(doubtful[frame])
+    def swapped(self) -> list[tuple[int, np.ndarray, float, float]]:
+        """Frames in which points exchange their places, the points, and the length of steps, m, as given and in the best order."""
+        found, far = [], self.away > LEAST
+        for frame in np.flatnonzero(far.sum(axis=1) > 1).tolist():
+            some = np.flatnonzero(far[frame])
             there, here = self.points[frame - self.gap[frame, some], some], self.points[frame, some]
             cost = np.linalg.norm(there[:, None] - here, axis=2)
             order = linear_sum_assignment(cost)[1]
             moved = np.flatnonzero(order != np.arange(len(some)))
-            if len(moved) and cost[moved, order[moved]].sum() < EXCHANGED * cost[moved, moved].sum():
-                found.setdefault(tuple(some[moved].tolist()), []).append(int(frame))
+            given, best = cost[moved, moved].sum(), cost[moved, order[moved]].sum()
+            if best < EXCHANGED * given:
+                found.append((frame, some[moved], given, best))
         return found
 
     @cached_property
     def stepped(self) -> np.ndarray:
         """[T, K] bool: steps far beyond those around and those of the others, that nothing else explains."""
         found = np.asarray(self.large & (self.speed > STEP * self.around * np.maximum(self.together, 1.0)))
-        for group, frames in self.swapped.items():
-            found[np.ix_(frames, group)] = False
+        for frame, group, *_ in self.swapped:
+            found[frame, group] = False
         for point, _, last in self.held:
             found[last + 1 :, point][: np.argmax(np.append(self.large[last + 1 :, point], True)) + 1] = False
         return found
@@ -177,12 +179,14 @@ def held(moving: Moving) -> dict[str, Any] | None:
     return told([(point, first, f"from frame {first} to {last}") for point, first, last in moving.held])
 
 
-def swapped(moving: Moving) -> list[dict[str, Any]]:
-    """Points whose labels are exchanged, and the frames."""
-    return [
-        {"value": len(group), "detail": f"points {group} from frame {at[0]} on", "frames": at}
-        for group, at in moving.swapped.items()
-    ]
+def swapped(moving: Moving) -> dict[str, Any] | None:
+    """Points that exchange their places; an error where their order changes often."""
+    words = told([(point, frame, f"in frame {frame}") for frame, group, *_ in moving.swapped for point in group])
+    if words and len(moving.swapped) > max(OFTEN * len(moving.given), NAMED):
+        _, _, given, best = zip(*moving.swapped, strict=True)
+        times = f"steps {sum(given) / max(sum(best), LEAST):.2g} times those in the best order"
+        words |= {"level": "error", "detail": f"in frames {spans(words['frames'])}; {times}"}
+    return words
 
 
 def stepped(moving: Moving) -> dict[str, Any] | None:

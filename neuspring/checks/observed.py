@@ -27,15 +27,18 @@ class Observed:
 
     @property
     def motion(self) -> tuple[float, float]:
-        """Farthest motion of the object in a training frame, m, which a tenth of its points exceed; largest share that is lost."""
+        """Farthest motion of the object in a training frame, m, which a tenth of its points exceed; largest share that is lost.
+
+        It is not known where frame 0 alone shows the object: inf.
+        """
         end, image, seen_of = self.observations.scenario.train_end, self.observations.image, self.observations
         if image is None:
             seen, points = seen_of.object_visibility[:end], seen_of.object_points
             moved = np.linalg.norm(points[:end] - points[0], axis=2)
         else:
             seen, moved = image.visible[:end], image.pixel_size * np.linalg.norm(image.pixels[:end] - image.pixels[0], axis=2)
-        tenths = (float(np.quantile(row[shown], 0.9)) for row, shown in zip(moved, seen, strict=True) if shown.any())
-        return max(tenths, default=0.0), 1 - min((float(shown.mean()) for shown in seen), default=1.0)
+        tenths = (float(np.quantile(row[shown], 0.9)) for row, shown in zip(moved[1:], seen[1:], strict=True) if shown.any())
+        return max(tenths, default=np.inf), 1 - min((float(shown.mean()) for shown in seen), default=1.0)
 
     @cached_property
     def apart(self) -> np.ndarray:

@@ -24,6 +24,7 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
     samples = {frame: Sample(capture.depth(camera, frame), labels[frame]) for frame in frames}
     found = examine("masks", where, Shown.of(capture, camera, labels), streams=streams)
     found += examine("object and hands", where, capture.cameras[camera], samples, streams=streams)
+    found += examine("repeats", where, capture, camera)
     return found + examine("segmentation", where, facts, streams=streams)
 
 

@@ -13,13 +13,15 @@ when any quarter of the time is left out. No name, number or time stamp is read.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
+from neuspring.core.text import spans
 from neuspring.data.camera import Camera, depth_noise
+from neuspring.data.capture import Capture
 
 WATCHED_WIDE, CELLS = 320, (24, 14)
 """Width, pixels, at which pictures are compared, and cells across and down."""
@@ -31,6 +33,9 @@ FEWEST = 8
 """Steps that both streams must have."""
 AGREE = 0.25
 """Correlation from which two streams show the same motion. Real and rendered recordings have 0.5 to 0.85, two cameras 0.4."""
+STALL, FEWEST_STALLS = 0.1, 3
+"""Motion in a step, as a part of that in the steps before and after it, below which an encoded image repeats its predecessor; and
+the number of such steps amid fast motion from which a recording repeats images. None of 67 real videos has so many."""
 HALF, MENDABLE = 0.5, 0.75
 """Frames: a shift that is a finding, as is how far a clear one may move without a quarter of the time; and one that whole frames
 mend."""
@@ -115,39 +120,26 @@ def _agreement(a: np.ndarray, b: np.ndarray, shift: int, kept: np.ndarray) -> fl
     return float((x * y).sum() / size) if size > 0 else np.nan
 
 
-@dataclass(eq=False)
 class Watched:
     """Motion in the pictures of one camera, frame by frame."""
 
-    frames: int
-    """Frames of the capture."""
-    color: np.ndarray = field(init=False)
-    """[T, n] by cell of the image, as `depth` and `masks`; NaN where the frame or the one before it is unknown."""
-    depth: np.ndarray = field(init=False)
-    masks: np.ndarray = field(init=False)
-    moving: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    """Frame -> pixels (x, y) [m, 2] that moved there, and their depth [m], m."""
-
-    def __post_init__(self) -> None:
-        self.color, self.depth, self.masks = (np.full((self.frames, CELLS[0] * CELLS[1]), np.nan) for _ in range(3))
-        self.repeated: dict[str, list[int]] = {"color": [], "depth": []}
+    def __init__(self, frames: int) -> None:
+        """Nothing so far, of a capture with so many frames."""
+        self.color, self.depth, self.masks = (np.full((frames, CELLS[0] * CELLS[1]), np.nan) for _ in range(3))
+        """[T, n] by cell of the image; NaN where the frame or the one before it is unknown."""
+        self.moving: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        """Frame -> pixels (x, y) [m, 2] that moved there, and their depth [m], m."""
         self._last: tuple[int, np.ndarray, np.ndarray | None, np.ndarray | None] | None = None
 
     def see(self, frame: int, color: np.ndarray, depth: np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """The next frame: RGB [H, W, 3] uint8, depth [H, W], m, 0: none, labels [H, W]."""
-        scale = min(1.0, WATCHED_WIDE / color.shape[1])
-        size = round(scale * color.shape[1]), round(scale * color.shape[0])
-        small = cv2.resize(np.ascontiguousarray(color), size, interpolation=cv2.INTER_AREA)
-        picture = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
+        picture = small(color)
+        size = picture.shape[1::-1]
         near = None if depth is None else cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         labels = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
         last, self._last = self._last, (frame, picture, near, labels)
         if last is None or last[0] != frame - 1:
             return
-        self.repeated["color"] += [frame] if np.array_equal(picture, last[1]) else []
-        before = last[2]
-        if near is not None and before is not None and near.any():
-            self.repeated["depth"] += [frame] if np.array_equal(near, before) else []
         change = np.clip(np.abs(picture - last[1]).max(axis=-1) - COLOR_STILL, 0, COLOR_MOST).astype(np.float32)
         self.color[frame] = _cells(change)
         if near is not None and last[2] is not None:
@@ -158,9 +150,18 @@ class Watched:
             nearest = np.where(both, np.minimum(near, last[2]), 0.0)
             y, x = np.nonzero((change > 0) & both)
             y, x = y[::2], x[::2]
-            self.moving[frame] = np.stack([x, y], axis=1) / scale, nearest[y, x]
-        if labels is not None and last[3] is not None:
+            self.moving[frame] = np.stack([x, y], axis=1) * color.shape[1] / size[0], nearest[y, x]
+        # A label that appears or vanishes is no motion.
+        if labels is not None and last[3] is not None and {*np.unique(labels)} == {*np.unique(last[3])}:
             self.masks[frame] = _cells((labels != last[3]).astype(np.float32))
+
+
+def small(image: np.ndarray) -> np.ndarray:
+    """An image [H, W, 3] of at most WATCHED_WIDE pixels across [h, w, 3], float32, without its finest noise."""
+    scale = min(1.0, WATCHED_WIDE / image.shape[1])
+    size = round(scale * image.shape[1]), round(scale * image.shape[0])
+    resized = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(resized.astype(np.float32), (0, 0), 1.0)
 
 
 def _cells(change: np.ndarray) -> np.ndarray:
@@ -179,7 +180,7 @@ def in_space(watched: Mapping[str, Watched], cameras: Mapping[str, Camera]) -> d
     shape = np.floor((high - low) / side).astype(int) + 1
     maps = {}
     for name, one in placed.items():
-        rows = np.full((watched[name].frames, int(np.prod(shape))), np.nan)
+        rows = np.full((len(watched[name].color), int(np.prod(shape))), np.nan)
         for frame, there in one.items():
             cell = np.floor((there - low) / side).astype(int)
             inside = ((cell >= 0) & (cell < shape)).all(axis=1)
@@ -211,9 +212,8 @@ def follows(hands: np.ndarray, points: np.ndarray) -> Shift | None:
     """
 
     def speed(places: np.ndarray) -> np.ndarray:
-        steps, known = np.linalg.norm(np.diff(places, axis=0), axis=2), np.full((len(places), 1), np.nan)
-        known[1:, 0] = [np.mean(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in steps]
-        return known
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=2)
+        return np.append(np.nan, np.ma.masked_invalid(steps).mean(axis=1).filled(np.nan))[:, None]
 
     shift = measure(speed(hands), speed(points))
     return shift if shift and shift.frames < 0 else None
@@ -244,14 +244,31 @@ def out_of_step(pairs: Sequence[Streams]) -> Iterator[dict[str, Any]]:
             yield told | {"next": streams.remedy.format(frames=round(frames))}
 
 
-def unlike(watched: Watched) -> float | None:
-    """Correlation of motion in the images and in the masks of one camera; None where too little moves in one of them."""
-    shift = measure(watched.color, watched.masks)
-    return None if shift is None else shift.agreement
+def unlike(watched: Mapping[str, Watched]) -> Iterator[dict[str, Any]]:
+    """Correlation of motion in the masks and in the images of each camera, as a part of the best one of all cameras.
+
+    The best one counts as 2 AGREE at least. None where too little moves in images or masks.
+    """
+    for name, one in watched.items():
+        # Cameras of one capture agree in time.
+        shifts = {other: measure(seen.color, one.masks, None if other == name else 2) for other, seen in watched.items()}
+        fits = {other: shift.agreement for other, shift in shifts.items() if shift}
+        best = max(fits, key=fits.__getitem__, default=name)
+        if name in fits:
+            told = {"where": f"camera {name}", "value": fits[name] / max(2 * AGREE, fits[best])}
+            clear = {"level": "error", "detail": f"masks fit camera {best}: {fits[best]:.2f}, and {name}: {fits[name]:.2f}"}
+            yield told | (clear if fits[best] >= 2 * AGREE else {})
 
 
-def repeats(watched: Watched) -> Iterator[dict[str, Any]]:
-    """Images of each stream that are equal to the one before."""
-    for kind, frames in watched.repeated.items():
+def repeats(capture: Capture, camera: str, watched: Watched | None = None) -> Iterator[dict[str, Any]]:
+    """Images of each stream of a camera that equal the one before: to the bit or, of color, but for its encoding."""
+    for kind, equal in capture.repeats[camera].items():
+        frames = equal
+        if watched is not None and kind == "color":
+            moved = np.append(np.nan_to_num(watched.color.mean(axis=1)), 0.0)
+            around = np.minimum(moved[:-2], moved[2:])
+            stalls = moved[1:-1] < STALL * around
+            if (stalls & (around > moved.mean())).sum() >= FEWEST_STALLS:
+                frames = sorted({*equal, *(np.flatnonzero(stalls) + 1).tolist()})
         if frames:
-            yield {"value": len(frames), "detail": f"{kind}, first is frame {frames[0]}", "frames": frames}
+            yield {"value": len(frames), "detail": f"{kind}, frames {spans(frames)}", "frames": frames}

@@ -6,7 +6,8 @@ import math
 import re
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 from pathlib import Path
 
 
@@ -25,6 +26,12 @@ def listed(names: Iterable[object], most: int = 12) -> str:
     """The names, separated by commas; of more than `most` the first ones, and how many others there are."""
     texts = [str(name) for name in names]
     return ", ".join(texts) if len(texts) <= most else f"{', '.join(texts[:most])} and {len(texts) - most} more"
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """Ascending numbers in few words: `6, 13, 20 to 25`."""
+    runs = [[number for _, number in part] for _, part in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])]
+    return listed((f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs), 6)
 
 
 def readable(value: float, unit: str) -> tuple[float, str]:

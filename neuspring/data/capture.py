@@ -16,6 +16,7 @@ and has no files.
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import json
 import os
@@ -23,6 +24,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -158,6 +160,22 @@ class Capture:
     @cached_property
     def _missing(self) -> dict[str, frozenset[int]]:
         return {c.name: frozenset(c.missing) for c in self.description.cameras}
+
+    @cached_property
+    def repeats(self) -> dict[str, dict[str, list[int]]]:
+        """Camera -> stream -> frames whose image equals the one before it to the bit: sensors have noise, so it is no new image."""
+        return {
+            name: {
+                kind: [int(there.stem) for here, there in pairwise(files) if filecmp.cmp(here, there, shallow=False)]
+                for kind in sorted(self.streams - {"mask"})
+                if (files := sorted((self.folder / kind / name).glob(5 * "[0-9]" + ".*")))
+            }
+            for name in self.cameras
+        }
+
+    def shows(self, camera: str, frame: int) -> bool:
+        """True where the camera has this frame and none of its images repeats the one before."""
+        return self.has(camera, frame) and frame not in chain(*self.repeats[camera].values())
 
     def path(self, what: Literal["color", "depth", "mask"], camera: str, frame: int) -> Path:
         """The file of one image."""

@@ -13,6 +13,9 @@ from PIL.ExifTags import Base
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 
+DARKEST = 16383
+"""A value that images of 16 bits exceed somewhere, and those of 14 bits nowhere."""
+
 
 def read_image(path: Path, camera: Camera, flag: int, remedy: str = "") -> np.ndarray:
     """A PNG of the camera's size, read with one of OpenCV's flags. Raises InputError, with `remedy` for a missing file."""
@@ -35,9 +38,18 @@ def read_picture(path: Path, flag: int) -> np.ndarray:
                 "Are they those of the sensor? Then remove the mark: exiftool -Orientation= FILES"
             )
             raise InputError(path, "an image must be stored upright, with EXIF orientation 1", turned, remedy)
-    if (image := cv2.imread(str(path), flag)) is None:
+    color = flag == cv2.IMREAD_COLOR
+    if (image := cv2.imread(str(path), cv2.IMREAD_UNCHANGED if color else flag)) is None:
         raise InputError(path, "this file must be a readable image", "a damaged file", "Copy it again from where it was made.")
-    return image
+    if not color or (image.dtype == np.uint8 and image.shape[2:] == (3,)):
+        return image
+    if image.dtype == np.uint16 and image.max() <= DARKEST:
+        remedy = "Write 8 bits, or multiply all images alike (12 bits by 16)."
+        raise InputError(path, "color of 16 bits must use its range, 0 to 65535", image.max(), remedy)
+    if image.shape[2:] == (4,) and np.ptp(image[..., 3]):
+        remedy = "Give images with their background. If it is there below the alpha: magick mogrify -alpha off FILES"
+        raise InputError(path, "color must be opaque", "transparent pixels", remedy)
+    return np.asarray(cv2.imread(str(path), flag))
 
 
 def read_array(path: Path, camera: Camera) -> np.ndarray:

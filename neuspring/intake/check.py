@@ -92,6 +92,7 @@ def check_capture(folder: Path) -> list[Finding]:
         watched[name] = Watched(capture.frame_count)
         samples[name], of_camera = _check_camera(capture, name, calibrated, grips, watched[name])
         findings += of_camera
+    findings += at(path, examine("mask fit", path, watched, streams=capture.streams))
     findings += examine("grips", path, grips, description.frame_rate, folder)
     if calibrated and capture.cameras:
         findings += at(path, examine("rig", path, _rig(capture, samples), streams=capture.streams))
@@ -150,8 +151,7 @@ def _check_camera(
     findings = [replace(alike[0], text=alike[0].text + more.get(key, "")) for key, alike in refused.items()]
     where, median = f"camera {name}", float(np.median(medians)) if medians else 0.0
     wrong_depth = examine("depths", where, median, streams=streams)
-    found = wrong_depth + examine("masks", where, shown) + examine("repeats", where, watched)
-    found += examine("mask fit", where, watched, streams=streams)
+    found = wrong_depth + examine("masks", where, shown) + examine("repeats", where, capture, name, watched)
     if calibrated and not wrong_depth:
         bodies = {frame: lifted(view, sample, OBJECT) for frame, sample in samples.items()}
         found += examine("object and hands", where, view, samples, streams=streams)

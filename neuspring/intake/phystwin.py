@@ -61,12 +61,18 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     Uses final_data.pkl and split.json; gt_track_3d.pkl (else no tracks) and metadata.json (else 30 frames per second) where
     present. Meters, float32, world with -z up. Raises InputError naming file and key.
     """
+    from neuspring.checks.moving import ORDER, Moving, swapped
+
     folder = Path(folder)
     data = arrays_of(folder / FINAL_DATA)
     frames = len(data["object_points"])
     train_end, tracks, rate = train_end_of(folder, frames), annotated(folder, frames), RELEASED_FRAME_RATE
     if (folder / METADATA).exists():
         rate = rate_of(folder / METADATA, metadata_of(folder), RELEASED_FRAME_RATE)
+    words = swapped(Moving(data["controller_points"], rate))
+    if words and "level" in words:
+        rule = "controller_points: each point must keep its index in all frames"
+        raise InputError(folder / FINAL_DATA, rule, f"other orders {words['detail']}", ORDER)
     return Observations(
         scenario=Scenario(
             name=row.scenario,

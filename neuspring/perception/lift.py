@@ -159,7 +159,8 @@ def clean_masks(
         for label in (OBJECT, HANDS):
             pixels, points = {}, []
             for name in names:
-                depth = depths[name]
+                # A repeated image does not show where the object is.
+                depth = depths[name] * (label == HANDS or capture.shows(name, frame))
                 pixels[name] = np.nonzero((masks[name].labels[frame] == label) & (depth > NEAREST) & (depth < FARTHEST))
                 y, x = pixels[name]
                 points.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))

@@ -83,7 +83,7 @@ def render(
         videos = {role: stack.enter_context(Video(path, scenario.frame_rate)) for role, path in files.items()}
         for frame, gaussians in enumerate(_frozen_at_end(frames, scenario.frame_count)):
             for name in scored.views:
-                if not capture.has(name, frame):
+                if not capture.shows(name, frame):
                     continue
                 pair = scored.pair(name, frame, gaussians)
                 scores = picture_scores(pair, lpips)

@@ -77,8 +77,18 @@ def test_what_motion_capture_does_is_named_once(fault):
     assert value in (None, found.value)
 
 
+@pytest.mark.parametrize("right", [lifted, lambda: np.tile(gripped(), (1, 2, 1)) + np.repeat([0.0, 0.03], 4)[:, None]])
+def test_an_order_that_changes_from_frame_to_frame_is_an_error(right):
+    points, rng = right(), np.random.default_rng(0)
+    (found,) = seen(np.stack([rng.permutation(row) for row in points]))
+    assert (found.name, found.level) == (SWAPPED, "error") and len(found.frames) > 0.9 * FRAMES
+    assert "in frames 1 to " in found.text and "times those in the best order" in found.text
+    assert found.value > 2 * FRAMES and found.remedy.startswith("Write each point at the same index")
+
+
 def test_points_are_named():
-    assert "points (0, 4) " in seen(exchanged(slice(25, None), [0, 4], [4, 0])(lifted()))[0].text
+    swapped = seen(exchanged(slice(25, None), [0, 4], [4, 0])(lifted()))[0].text
+    assert "(point 0 in frame 25, point 4 in frame 25)" in swapped
     zeros = seen(put(0.0, slice(30, 41), 4)(lifted()))[0].text
     assert "point 4 from frame 30 on is [0.0, 0.0, 0.0]" in zeros and zeros.endswith("Write null.")
 

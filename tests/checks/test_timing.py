@@ -1,5 +1,7 @@
 """Time of two streams by what moves: the shift in closed form, and on films of a desk that were put together wrongly."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -13,10 +15,10 @@ FRAMES, STRIDE = 24, 3
 """Pictures, and frames of the desk from one to the next: its ball moves by 15 mm."""
 
 
-def bumps(shift=0.0, count=40, cells=60):
-    """A bump that runs over cells with changing speed [T, n], seen `shift` frames late."""
+def bumps(shift=0.0, count=40, cells=60, at=0):
+    """A bump that runs over cells with changing speed [T, n], from cell `at` on, seen `shift` frames late."""
     time = np.arange(count) - shift
-    place = 30 + 20 * np.sin(time / 5) + 0.2 * time
+    place = at + 30 + 20 * np.sin(time / 5) + 0.2 * time
     return np.exp(-0.5 * ((np.arange(cells) - place[:, None]) / 3) ** 2)
 
 
@@ -61,11 +63,40 @@ def test_depth_of_other_moments_is_found(late):
     )
 
 
-def test_a_film_in_which_nothing_moves_has_no_shift_and_repeats_its_images():
+def test_a_film_in_which_nothing_moves_has_no_shift():
     one = film(still=True)
     assert measure(one.color, one.depth) is None
-    assert one.repeated["color"] == list(range(1, FRAMES)) and film().repeated == {"color": [], "depth": []}
-    assert next(iter(examine("repeats", "camera 0", one))).value == FRAMES - 1
+
+
+@pytest.mark.parametrize(("each", "found"), [(1, []), (2, [3, 5, 7])])
+def test_an_encoded_video_that_repeats_its_images(each, found):
+    """Encoded again, equal images differ a little."""
+    one, noise = Watched(10), np.random.default_rng(0)
+    for frame in range(10):
+        image = seen(camera(), 3 * STRIDE * (frame // each))[0].astype(int) + noise.integers(-1, 2, (180, 240, 3))
+        one.see(frame, image.clip(0, 255).astype(np.uint8))
+    capture = SimpleNamespace(repeats={"0": {"color": [], "depth": []}})
+    assert [list(one.frames) for one in examine("repeats", "x", capture, "0", one)] == [found] * bool(found)
+
+
+def test_masks_of_another_camera_are_known_by_their_motion():
+    watched = {"0": Watched(FRAMES), "1": Watched(FRAMES)}
+    watched["0"].color[1:], watched["1"].color[1:] = (bumps(cells=CELLS[0] * CELLS[1], at=at)[1:FRAMES] for at in (0, 100))
+    for one in watched.values():
+        one.masks = watched["0"].color
+    (found,) = examine("mask fit", "x", watched)
+    assert (found.where, found.level) == ("camera 1", "error") and "masks fit camera 0: 1.00, and 1: " in found.text
+    watched["1"].masks = watched["1"].color
+    assert examine("mask fit", "x", watched) == []
+
+
+def test_a_label_that_appears_is_no_motion():
+    one, image = Watched(3), np.zeros((180, 240, 3), np.uint8)
+    for frame in range(3):
+        mask = np.zeros((180, 240), np.uint8)
+        mask[frame * 10 : 60 + frame * 10, :60] = frame > 0
+        one.see(frame, image, mask=mask)
+    assert np.isnan(one.masks[1]).all() and one.masks[2].sum() > 0
 
 
 def test_cameras_of_other_moments_are_found_in_space():

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neuspring.checks.masks import mask_facts
+from neuspring.checks.masks import mask_facts, motions
 from neuspring.checks.perceived import look_at_lifted, look_at_masks, look_at_observations, look_at_tracks
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
@@ -64,7 +64,7 @@ def moving(tmp_path_factory):
         image[TOP : TOP + SIDE, LEFT + frame : LEFT + frame + SIDE] = grain[:SIDE]
         image[TOP + SIDE : SIZE[0], LEFT : LEFT + SIDE] = grain[SIDE : SIZE[0] - TOP]
         image += rng.normal(0, 1, image.shape)
-        writer.frame("0", frame, image.astype(np.uint8), np.full(SIZE, 800, np.uint16))
+        writer.frame("0", frame, image.astype(np.uint8), np.full(SIZE, 800 + frame, np.uint16))
     return writer.finish()
 
 
@@ -95,6 +95,7 @@ def test_an_object_that_unfolds_moves_though_it_leaves_no_place(moving, tmp_path
     for frame in range(LONG):
         image = first.copy()
         image[TOP : TOP + SIDE, LEFT : LEFT + SIDE] = 90
+        image[0, 0] = frame
         if frame > 4:
             image[TOP + 10 : TOP + SIDE, LEFT : LEFT + SIDE] = first[TOP + 10 : TOP + SIDE, LEFT : LEFT + SIDE]
         cv2.imwrite(str(capture.path("color", "0", frame)), image)
@@ -102,6 +103,15 @@ def test_an_object_that_unfolds_moves_though_it_leaves_no_place(moving, tmp_path
     unfolded[5:, TOP + 10 : TOP + SIDE, LEFT : LEFT + SIDE] = OBJECT
     for mask in (labels, unfolded):
         assert mask_facts(capture, "0", mask)["object_moves"] > 0.6
+
+
+def test_an_object_is_not_at_rest_where_no_new_image_shows_it(moving, tmp_path):
+    capture = Capture.load(shutil.copytree(moving.folder, tmp_path / "stuck"))
+    for frame in range(11, LONG):
+        shutil.copyfile(capture.path("color", "0", 10), capture.path("color", "0", frame))
+    assert [motion.frame for motion in motions(capture, "0", both_squares())] == list(range(11))
+    (found,) = (one for one in looked_at(capture, both_squares()) if one.name == "repeated images")
+    assert found.frames == tuple(range(11, LONG)) and "color, frames 11 to 29" in found.text
 
 
 def test_lost_tracks_are_reported(capture):

@@ -1,5 +1,6 @@
 """From pixels to the world: cleaned masks, agreement of motion, controllers, and their limits."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.perception import Lift
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
-from neuspring.data.capture import HANDS, OBJECT, Writer
+from neuspring.data.capture import HANDS, OBJECT, Capture, Writer
 from neuspring.data.results import Masks, PixelTracks
 from neuspring.perception import lift as lifting
 from neuspring.perception.controllers import GRASP_REACH, choose_controllers, fill_rigidly, hands_of, rigid_motion
@@ -38,8 +39,10 @@ def scene(tmp_path):
         labels = np.zeros((24, 32), np.uint8)
         labels[6:16, 4 + frame // 2 : 14 + frame // 2] = OBJECT
         labels[6:16, 18 + frame // 2 : 28 + frame // 2] = HANDS
-        depth = np.where(labels > 0, 800, 900).astype(np.uint16)
-        writer.frame("0", frame, np.full((24, 32, 3), 40 * labels[..., None], np.uint8), depth, labels)
+        depth, color = np.where(labels > 0, 800, 900).astype(np.uint16), np.full((24, 32, 3), 40 * labels[..., None], np.uint8)
+        # Noise in a corner: images that are equal to the bit are no new ones.
+        depth[0, 0], color[0, 0] = 900 + frame, frame
+        writer.frame("0", frame, color, depth, labels)
     return writer.finish()
 
 
@@ -67,6 +70,17 @@ def test_points_lie_where_the_camera_saw_them(scene):
     np.testing.assert_allclose(lifted.object_colors, 40 / 255, atol=1e-6)
     assert lifted.controller_points.shape == (FRAMES, 30, 3)
     assert len(lifted.cloud) == 100
+
+
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_repeated_images_show_nothing_of_the_object(scene, kind):
+    for frame in (2, 3):
+        shutil.copyfile(scene.path(kind, "0", 1), scene.path(kind, "0", frame))
+    capture = Capture.load(scene.folder)
+    assert capture.repeats["0"][kind] == [2, 3] and [capture.shows("0", frame) for frame in range(FRAMES)] == [1, 1, 0, 0, 1]
+    lifted = lifting.lift_tracks(capture, masks_of(capture), tracks_of(capture), SETTINGS)
+    assert lifted.object_visibility.all(axis=1).tolist() == [True, True, False, False, True]
+    assert not lifted.object_visibility[2:4].any() and lifted.controller_points.shape[0] == FRAMES
 
 
 def test_a_track_that_leaves_the_mask_is_invisible_and_zero(scene):

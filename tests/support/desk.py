@@ -88,10 +88,12 @@ def write_json(path, value):
     return path
 
 
-def write_video(path, images, codec, stored, rate=15):
-    """A video of RGB or 16-bit gray images by a codec and pixel format of FFmpeg."""
+def write_video(path, images, codec, stored, rate=15, options=None, **context):
+    """A video of RGB or 16-bit gray images by a codec and pixel format of FFmpeg, with options and values of its context."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
+        stream = container.add_stream(codec, rate=rate, options=options)
+        for name, value in context.items():
+            setattr(stream.codec_context, name, value)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = stored
         for image in images:

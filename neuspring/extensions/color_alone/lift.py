@@ -116,8 +116,8 @@ def lift_color(
     hidden = np.stack([x, y], axis=1)[::HIDDEN_STRIDE].astype(np.float32)
     pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
     visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
-    # Nothing of the object is handed on from future frames.
-    visible[capture.train_end :] = False
+    # Nothing of the object is handed on from future frames, or of repeated images.
+    visible[[not capture.shows(name, frame) or frame >= capture.train_end for frame in range(frames)]] = False
     pixels = np.where(visible[..., None], pixels, 0.0)
     places = np.concatenate([tracks.pixels[0, own], hidden])
     points = np.zeros((frames, len(places), 3))

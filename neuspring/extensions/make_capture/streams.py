@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
 from neuspring.core.errors import InputError
-from neuspring.core.text import listed
+from neuspring.core.text import spans
 from neuspring.data.camera import Lens
 from neuspring.data.capture import FEWEST_FRAMES
 
@@ -234,9 +234,3 @@ def chosen(wanted: str, numbers: Sequence[int]) -> list[int]:
         raise InputError("--frames", "FIRST-LAST or FIRST-LAST/STEP is required, like 250-335 or 0-300/2", repr(wanted))
     kept = range(int(first), int(last) + 1, int(step or 1))
     return [number for number in numbers if number in kept]
-
-
-def spans(numbers: Sequence[int]) -> str:
-    """Ascending numbers in few words: `6, 13, 20 to 25`."""
-    runs = [[number for _, number in part] for _, part in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])]
-    return listed((f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs), 6)

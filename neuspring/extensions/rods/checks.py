@@ -92,7 +92,7 @@ class Cable:
 
     def __init__(self, moving: Moving, settings: Mocap) -> None:
         self.moving, self.settings = moving, settings
-        self.points = moving.points[: min((frame for frames in moving.swapped.values() for frame in frames), default=None)]
+        self.points = moving.points[: min((frame for frame, *_ in moving.swapped), default=None)]
         self.apart = apart(self.points, np.nanmax)
         self.along = np.append(0.0, np.cumsum(np.diag(apart(self.points, np.nanmedian), 1)))
 

@@ -123,7 +123,7 @@ def silhouettes(
         (name, frame): torch.tensor(perceived.labels[frame], device=device) == OBJECT
         for name, perceived in masks_of_cameras(capture, pictures.masks).items()
         for frame in range(capture.train_end)
-        if capture.has(name, frame)
+        if capture.shows(name, frame)
     }
     views = {name: view_of(camera, device) for name, camera in capture.cameras.items()}
     features = None if isinstance(weights, str) else load_features(weights, device)

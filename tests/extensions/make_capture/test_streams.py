@@ -2,13 +2,16 @@
 
 import shutil
 from datetime import datetime, timedelta
+from fractions import Fraction
 
+import cv2
 import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
+from neuspring.core.text import spans
 from neuspring.extensions.make_capture.formats import open_images
-from neuspring.extensions.make_capture.streams import CameraStreams, Series, choose, chosen, matched, spans
+from neuspring.extensions.make_capture.streams import CameraStreams, Series, choose, chosen, matched
 from tests.support.desk import FRAMES, write_folders, write_video
 
 BEGIN = datetime(2024, 5, 1, 12, 30, 15, 33000)
@@ -125,6 +128,50 @@ def test_ranges_of_frames():
         with pytest.raises(InputError, match="FIRST-LAST or FIRST-LAST/STEP"):
             chosen(wrong, range(9))
     assert spans([6, 13, 20, 21, 22]) == "6, 13, 20 to 22"
+
+
+@pytest.mark.parametrize(
+    ("made", "received", "line"),
+    [
+        ({"options": {"x264-params": "interlaced=1:tff=1"}}, "interlaced", "bwdif=mode=send_frame"),
+        ({"color_primaries": 9, "color_trc": 18, "colorspace": 9}, r"HDR \(PQ or HLG\)", "tonemap"),
+        ({"color_primaries": 9, "color_trc": 14, "colorspace": 9}, "colors of BT.2020", "p=bt709"),
+        ({"sample_aspect_ratio": Fraction(4, 3)}, "pixels of 4/3", "setsar=1"),
+        ({}, "a mark by which players turn or flip it", "scale=WIDTH:HEIGHT"),
+    ],
+)
+def test_videos_of_other_kinds_are_refused_with_the_line_that_converts_them(desk, tmp_path, made, received, line):
+    frames = list(open_images(desk / "color_0", "color").read(range(FRAMES)))
+    path = write_video(tmp_path / "color.mp4", frames, "libx264", "yuv420p", **made)
+    if not made:
+        data = bytearray(path.read_bytes())
+        at = data.index(b"tkhd") + 44  # the display matrix of version 0, by rows
+        data[at + 16 : at + 20] = (-(1 << 16)).to_bytes(4, "big", signed=True)
+        path.write_bytes(data)
+    with pytest.raises(InputError, match=f"received {received}.*ffmpeg -i VIDEO -vf .*{line}"):
+        open_images(path, "color").series  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda image: image * np.uint16(16), "use its range, 0 to 65535; received [1-4][0-9]{3}. .*12 bits by 16"),
+        (
+            lambda image: np.dstack([image, 255 * (np.indices(image.shape[:2])[0] > 3)]).astype(np.uint8),
+            "opaque; received .*alpha off",
+        ),
+        (lambda image: image * np.uint16(257), None),
+        (lambda image: np.dstack([image, np.full(image.shape[:2], 255, np.uint8)]), None),
+    ],
+)
+def test_color_that_8_bits_do_not_show_is_refused(desk, tmp_path, change, words):
+    image = cv2.imread(str(desk / "color_0" / "frame_0.png"))
+    cv2.imwrite(str(tmp_path / "0.png"), change(image))
+    if words:
+        with pytest.raises(InputError, match=words):
+            next(open_images(tmp_path, "color").read([0]))
+    else:
+        np.testing.assert_array_equal(next(open_images(tmp_path, "color").read([0])), image[..., ::-1])
 
 
 def test_videos_are_paired_by_their_stamps_and_depth_must_be_exact(desk, tmp_path):

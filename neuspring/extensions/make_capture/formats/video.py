@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     import av
 
 VIDEO_ENDINGS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
+TONE_MAP = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip,zscale=t=bt709:m=bt709:r=tv,format=yuv420p"
+SQUARE = "scale=WIDTH:HEIGHT,setsar=1"
+"""ffmpeg applies marks by itself; WIDTH and HEIGHT are those of the intrinsics."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
 
@@ -62,14 +65,17 @@ class VideoFile:
 
     def _require_plain(self, frame: av.VideoFrame, stream: av.VideoStream) -> None:
         ratio, matrix = stream.sample_aspect_ratio, [one for one in frame.side_data if "DISPLAYMATRIX" in str(one)]
-        if frame.rotation or matrix or (ratio and ratio != 1):
-            received = f"turned by {frame.rotation} degrees" if frame.rotation else "flipped" if matrix else f"pixels of {ratio}"
-            remedy = "Write it as the intrinsics are: ffmpeg -i VIDEO -vf scale=WIDTH:HEIGHT,setsar=1 -crf 12 upright.mp4"
-            raise InputError(self.path, "a video must be stored upright, with square pixels", received, remedy)
-        if frame.interlaced_frame or (stream.codec_context.color_trc in (16, 18)):
-            received = "interlaced" if frame.interlaced_frame else "HDR (PQ or HLG)"
-            remedy = "Convert it: ffmpeg -i VIDEO -vf bwdif (interlaced) or a tone map (HDR) -crf 12 plain.mp4"
-            raise InputError(self.path, "a video must have whole frames of 8-bit color", received, remedy)
+        codec = stream.codec_context
+        for received, wrong, filters in (
+            ("a mark by which players turn or flip it", matrix, SQUARE),
+            (f"pixels of {ratio}", ratio not in (None, 0, 1), SQUARE),
+            ("interlaced", frame.interlaced_frame, "bwdif=mode=send_frame"),
+            ("HDR (PQ or HLG)", codec.color_trc in (16, 18), TONE_MAP),
+            ("colors of BT.2020", codec.color_primaries == 9, "zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"),
+        ):
+            if wrong:
+                rule = "a video must be upright, of square pixels, whole frames, and 8-bit colors of BT.709 or BT.601"
+                raise InputError(self.path, rule, received, f"Convert it: ffmpeg -i VIDEO -vf {filters} -crf 12 plain.mp4")
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
         """As a folder. The video is decoded from its beginning. Raises InputError where it ends early."""
