@@ -4,15 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
 from neuspring.config.extensions import with_extensions
 from neuspring.core.section import Count, NonNegative, Positive, Range, SettingsSection
+from neuspring.registry import Registry
+
+T = TypeVar("T")
+
+
+TERMS: Registry[Any] = Registry(
+    "losses", {name: f"neuspring.twin.losses:{name}" for name in ("chamfer", "track", "acceleration", "image_track", "silhouette")}
+)
+"""Every term of the training loss, by the name of its weight: a function of a `FrameLoss` and a `FrameState` that returns the
+loss, or None where it does not apply."""
+
+
+def _with_terms(kind: type[T]) -> type[T]:
+    """Decorate `Losses`, below its `dataclass`: a term of a package has a weight of its name, 0 where it is not set."""
+    for name in TERMS:
+        if name not in kind.__annotations__:
+            kind.__annotations__[name] = NonNegative
+            setattr(kind, name, 0.0)
+    return kind
 
 
 @dataclass(frozen=True, kw_only=True)
+@_with_terms
 class Losses(SettingsSection):
     """Weights of the training losses; the defaults are those of the released PhysTwin code."""
 

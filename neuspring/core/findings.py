@@ -92,13 +92,11 @@ def refused(findings: Iterable[Finding]) -> bool:
 
 
 def refuse(findings: Iterable[Finding]) -> None:
-    """Raise the first error among findings about a data set as InputError, naming file and key; else print warnings."""
+    """Raise the errors among findings about a data set as one InputError, naming file and key; else print warnings."""
     listed = list(findings)
     errors = [one for one in listed if one.level == "error"]
     if errors:
-        more = f"{len(errors) - 1} more: " if len(errors) > 1 else ""
-        remedy = f"{more}`neuspring check-data` lists every finding."
-        raise InputError(errors[0].where, errors[0].message.rstrip("."), remedy=remedy)
+        raise InputError(errors[0].where, errors[0].message.rstrip("."), remedy=" ".join(map(str, errors[1:])))
     for one in listed:
         if one.level == "warning":
             print(one)

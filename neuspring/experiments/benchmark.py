@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
-import os
 import shlex
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
@@ -214,7 +213,7 @@ class Benchmark:
         )
         """Methods of the whole configuration that are trained on pictures."""
         self.absent: InputError | None = None
-        """All data that are not there."""
+        """All data that are not there or are refused."""
         self._check(plan_only)
         self._check_effect(flat(values.get("fit") or {}))
 
@@ -315,39 +314,33 @@ class Benchmark:
             raise InputError(f"configuration, fit.{idle[0]}", rule, f"{given[idle[0]]} beside {', '.join(own)}", remedy)
 
     def _check_data(self, plan_only: bool) -> None:
-        """Data that are absent are told of all scenarios at once, before anything else of their data."""
-        placed = {name: path for name in self.scenarios if (path := self.data_path(name)) is not None}
-        lacking = {name: path for name in placed if (path := self._lacking(name)) is not None}
-        self.absent = self._absence(lacking, len(placed)) if lacking else None
+        """Data that are absent or refused are told of all scenarios at once."""
+        found = {name: self._refused(name, path) for name in self.scenarios if (path := self.data_path(name)) is not None}
+        wrong = {name: error for name, error in found.items() if error}
+        self.absent = next(iter(wrong.values()), None)
+        if len(wrong) > 1:
+            rule = f"the data of {len(wrong)} of {len(found)} scenarios must exist and be readable"
+            self.absent = InputError(listed(wrong, 3), rule, remedy=f"The first: {self.absent}")
         if self.absent and not plan_only:
             raise self.absent
-        for name, path in placed.items():
-            if name not in lacking:
-                source = self.source(name)
-                source.required(path)
-                if source.films and not source.write_capture:
-                    BACKENDS["segment"][self.config.perception.segment.backend].require(path)
 
-    def _lacking(self, name: str) -> Path | None:
-        """The first file of a scenario that must be there and is not."""
-        path, needed = self.data_path(name), self.source(name).needed
-        assert path is not None
-        files = [path / file for file in needed] or [path]
-        return next((file for file in files if self.config.data_root is None or not file.exists()), None)
-
-    def _absence(self, lacking: Mapping[str, Path], count: int) -> InputError:
-        name, path = next(iter(lacking.items()))
+    def _refused(self, name: str, path: Path) -> InputError | None:
+        """The first thing that is wrong with the data of a scenario, as far as small files say."""
         row, source, root = self.scenarios[name], self.source(name), self.config.data_root
         if root is None:
             remedy = "Give it: --config data_root=/path/to/data."
             remedy += f" {source.remedy.format(data_root='/path/to/data')}" if source.needed else ""
             return InputError(f"scenario {name}", f"{row.source} scenarios need data_root", "null", remedy)
-        remedy = source.remedy.format(data_root=root)
-        if len(lacking) == 1:
-            return InputError(f"scenario {name}", "its data must exist", path, remedy)
-        files = " or ".join(dict.fromkeys(one.name if self.source(each).needed else each for each, one in lacking.items()))
-        above = os.path.commonpath([one.parent for one in lacking.values()])
-        return InputError(above, f"{len(lacking)} of {count} scenarios lack {files} ({listed(lacking, 3)})", remedy=remedy)
+        for file in [path / file for file in source.needed] or [path]:
+            if not file.exists():
+                return InputError(f"scenario {name}", "its data must exist", file, source.remedy.format(data_root=root))
+        try:
+            source.required(path)
+            if source.films and not source.write_capture:
+                BACKENDS["segment"][self.config.perception.segment.backend].require(path)
+        except InputError as error:
+            return error
+        return None
 
     # --- what is asked of it
 

@@ -43,15 +43,18 @@ WORK_UNITS: dict[str, Callable[[Config], int]] = {
 
 def told(graph: Graph, todo: Sequence[Unit], files: Sequence[Path], *, gpus: Sequence[str], cores: int, cluster: bool) -> str:
     """A dozen lines at most; none where nothing is to be done. `todo`: jobs; `files`: those of --configfile, in order."""
-    absent = graph.benchmark.absent
-    if not (todo or absent):
+    known = graph.benchmark
+    if not (todo or known.absent):
         return ""
-    lines = [f"missing  {absent} A run stops before its first job."] if absent else []
+    lines = [f"missing  {known.absent} A run stops before its first job."] if known.absent else []
+    large = [Path(known.data_path(name) or "", file) for name in known.scenarios for file in known.source(name).needed]
+    seen = Counter(path.name for path in large if path.suffix != ".json" and path.exists())
+    lines += [f"data     {file} of {count} scenarios exists; only jobs read it" for file, count in seen.items()]
     counts = Counter(unit.rule for unit in todo)
     lines += [f"jobs     {len(todo):,}: {', '.join(f'{rule} {count:,}' for rule, count in counts.items())}"]
     lines += [f"time     {line}" for line in _times(graph, todo, len(gpus), 0 if cluster else cores)]
     where = f"GPU {listed(gpus)}, {graph.config.gpus.jobs_per_gpu} job(s) on each" if gpus else "no GPU"
-    if graph.benchmark.on_gpu and not gpus:
+    if known.on_gpu and not gpus:
         where = "there is no GPU here: device: cuda is refused when this is no dry run"
     lines += [f"devices  {'those of the cluster' if cluster else f'{cores} cores; {where}'}"]
     studies = f", studies/ ({listed(graph.config.studies)})" if graph.config.studies else ""

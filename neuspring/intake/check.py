@@ -218,13 +218,16 @@ def is_case(folder: Path) -> bool:
 
 
 def _check_case(folder: Path) -> list[Finding]:
-    """What the readers of a case refuse: of its processed data, and of its calibration where it has images."""
+    """What the readers of a case refuse: of its processed data, and of its raw data where it has images."""
     findings = list[Finding]()
     row = ScenarioRow(scenario=folder.name, source="phystwin", category="", path=".", self_collision=False, ground=True)
     readers: list[Callable[[], Any]] = []
-    if (folder / FINAL_DATA).exists() or not (folder / "color").is_dir():
+    images = (folder / "color").is_dir()
+    if (folder / FINAL_DATA).exists() or not images:
         readers.append(lambda: phystwin.read(row, folder))
-    if (folder / phystwin.CALIBRATION).exists():
+    if images:
+        readers.append(lambda: phystwin_raw.read(folder.name, "", folder))
+    elif (folder / phystwin.CALIBRATION).exists():
         readers.append(lambda: phystwin_raw.read_calibration(folder))
     for reader in readers:
         try:

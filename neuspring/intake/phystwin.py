@@ -66,9 +66,8 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     folder = Path(folder)
     data = arrays_of(folder / FINAL_DATA)
     frames = len(data["object_points"])
-    train_end, tracks, rate = train_end_of(folder, frames), annotated(folder, frames), RELEASED_FRAME_RATE
-    if (folder / METADATA).exists():
-        rate = rate_of(folder / METADATA, metadata_of(folder), RELEASED_FRAME_RATE)
+    train_end, rate = split_and_rate(folder, frames)
+    tracks = annotated(folder, frames)
     words = swapped(Moving(data["controller_points"], rate))
     if words and "level" in words:
         rule = "controller_points: each point must keep its index in all frames"
@@ -96,6 +95,15 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     )
 
 
+def split_and_rate(case: Path, frames: int | None = None) -> tuple[int, float]:
+    """End of training and frames per second, of the small files, which a plan reads without the number of frames.
+
+    Raises InputError.
+    """
+    metadata = metadata_of(case) if (case / METADATA).exists() else {}
+    return train_end_of(case, frames), rate_of(case / METADATA, metadata, RELEASED_FRAME_RATE)
+
+
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
     """The arrays of final_data.pkl. Raises InputError for the first rule that they break."""
     data: dict[str, np.ndarray] = load_pickle(path)
@@ -112,19 +120,18 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
         _require(list(value.shape) == wanted, path, f"{form}, here {wanted}", list(value.shape))
         bad = np.argwhere(~np.isfinite(value))
         _require(not len(bad), path, f"{key}: every coordinate must be finite", bad[:1].tolist())
-    visible, points = data["object_visibilities"], data["object_points"]
+    visible, points, moves = data["object_visibilities"], data["object_points"], data["object_motions_valid"]
     both = visible[:-1] & visible[1:]
-    rules = {
-        "object_points: at least 2 frames and one point are required": len(visible) > 1 and visible.shape[1] > 0,
-        "controller_points: at least one controller point is required": sizes["C"] > 0,
-        "object_visibilities: every tracked point must be visible in frame 0, which is the rest state": visible[:1].all(),
-        "object_motions_valid: a valid motion requires the point to be visible in both frames": not (
-            data["object_motions_valid"][:-1] & ~both
-        ).any(),
-        "object_points: up is -z, and the object must not be below the table": not (points.size and np.median(points[0, :, 2]) > 0),
+    faults = {
+        "object_points: at least 2 frames and one point are required": (len(visible) < 2 or not points.size) and visible.shape,
+        "controller_points: at least one controller point is required": not sizes["C"] and "none",
+        "object_visibilities: no point may be hidden in frame 0, the rest state": (~visible[:1]).sum(),
+        "object_motions_valid: no motion may be valid where its point is hidden before or after": (moves[:-1] & ~both).sum(),
+        "object_points: up is -z, and the object's median may not be below the table, m": points.size
+        and max(0.0, np.median(points[0, :, 2])),
     }
-    for rule, kept in rules.items():
-        _require(kept, path, rule, "another array")
+    for rule, fault in faults.items():
+        _require(not fault, path, rule, fault)
     return dict(data)
 
 
@@ -180,12 +187,13 @@ def annotated(case: Path, frames: int) -> np.ndarray | None:
     return np.asarray(tracks, dtype=float)
 
 
-def train_end_of(case: Path, frames: int) -> int:
+def train_end_of(case: Path, frames: int | None) -> int:
     """Training frames are [0, this) as split.json states. Raises InputError."""
     split = load_json(case / SPLIT)
     for key in ("train", "test"):
         value = split.get(key) if isinstance(split, dict) else None
         whole = isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)
-        inside = whole and 0 <= value[0] <= value[1] <= frames and (key == "test" or value[1] >= 2)  # type: ignore[index]
-        _require(inside, case / SPLIT, f"{key}: whole numbers [start, end) within {frames} frames are required", value)
+        inside = whole and 0 <= value[0] <= value[1] <= (frames or value[1]) and (key == "test" or value[1] >= 2)  # type: ignore[index]
+        within = f" within {frames} frames" if frames else ""
+        _require(inside, case / SPLIT, f"{key}: whole numbers [start, end){within} are required", value or split)
     return int(split["train"][1])

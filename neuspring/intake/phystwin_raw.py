@@ -35,6 +35,7 @@ from neuspring.intake.phystwin import CALIBRATION, METADATA, SPLIT, annotated, m
 
 BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
+STREAMS: dict[Literal["color", "depth"], str] = {"color": ".png", "depth": ".npy"}
 UNIT_KEY = "depth_scale_m_per_unit"
 """Key of metadata.json, m per count; 0.001 in released cases, which do not have it."""
 
@@ -44,15 +45,18 @@ def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) ->
     convert(row.scenario, row.category, path, folder)
 
 
-def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
-    """Write `case` as a capture folder. Raises InputError naming file and key."""
-    case = Path(case)
+def read(name: str, category: str, case: Path) -> tuple[Description, list[Camera], dict[str, dict[int, list[str]]]]:
+    """What a case states, for its capture and for check-data: the description, the cameras, and each camera's detections by label.
+
+    There are no detections without masks. Raises InputError.
+    """
     metadata, cameras = read_calibration(case)
-    frames, has_masks, missing = int(metadata["frame_num"]), (case / "mask").is_dir(), dict[str, tuple[int, ...]]()
-    endings: dict[Literal["color", "depth"], str] = {"color": ".png", "depth": ".npy"}
-    for camera in cameras:
-        files = {frame: [case / kind / camera.name / f"{frame}{endings[kind]}" for kind in endings] for frame in range(frames)}
-        missing[camera.name] = tuple(frame for frame, paths in files.items() if not all(path.is_file() for path in paths))
+    frames, has_masks = int(metadata["frame_num"]), (case / "mask").is_dir()
+
+    def complete(camera: str, frame: int) -> bool:
+        return all((case / kind / camera / f"{frame}{ending}").is_file() for kind, ending in STREAMS.items())
+
+    missing = {one.name: tuple(frame for frame in range(frames) if not complete(one.name, frame)) for one in cameras}
     unit = stated(case / METADATA, metadata, [UNIT_KEY], "a positive number of m per count", 0.001)
     description = Description(
         format=1,
@@ -69,18 +73,25 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
         provenance={name: f"sha256:{digest_file(case / name)}" for name in (METADATA, CALIBRATION)},
     )
     refuse(description_findings(case / "color", description))
-    first = case / "depth" / cameras[0].name / "0.npy"
-    if (dtype := read_array(first, cameras[0]).dtype) != np.uint16:
-        remedy = f"Write uint16, and the unit as {UNIT_KEY} of {METADATA} (m per count), if it is not 0.001."
-        raise InputError(first, "depth must be 16-bit counts", dtype, remedy)
-    writer = Writer(folder, description)
     for camera in cameras:
-        ids = detections(case, camera.name) if has_masks else {}
+        frame = next((frame for frame in range(frames) if frame not in missing[camera.name]), 0)
+        first = case / "depth" / camera.name / f"{frame}.npy"
+        if (dtype := read_array(first, camera).dtype) != np.uint16:
+            remedy = f"Write uint16, and the unit as {UNIT_KEY} of {METADATA} (m per count), if it is not 0.001."
+            raise InputError(first, "depth must be 16-bit counts", dtype, remedy)
+    return description, cameras, {camera.name: detections(case, camera.name) for camera in cameras if has_masks}
+
+
+def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
+    """Write `case` as a capture folder. Raises InputError naming file and key."""
+    description, cameras, ids = read(name, category, case)
+    writer, frames = Writer(folder, description), description.frame_count
+    for camera in cameras:
         for frame in (frame for frame in range(frames) if writer.capture.has(camera.name, frame)):
-            for kind, ending in endings.items():
+            for kind, ending in STREAMS.items():
                 writer.link(kind, camera.name, frame, case / kind / camera.name / f"{frame}{ending}")
-            if has_masks:
-                writer.mask(camera.name, frame, labels_of(case, camera, frame, ids))
+            if ids:
+                writer.mask(camera.name, frame, labels_of(case, camera, frame, ids[camera.name]))
     return writer.finish(annotated(case, frames))
 
 

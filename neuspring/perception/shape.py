@@ -58,8 +58,8 @@ MASK_BORDER = 3
 LEAST_THICKNESS = 0.006
 """m: a body is at least this thick."""
 POSES = 24 * 8
-REFINED = 6
-"""Best poses that are refined to the end."""
+REFINED = 24
+"""Best poses that are refined to the end: with 6, one in 16 turns of a flat body ends in a wrong pose."""
 ITERATIONS = 40
 COMPARED_SURFACE = 1500
 """Points of cloud and mesh that are compared."""
@@ -67,9 +67,9 @@ INLIERS = 0.85
 """Share of the nearest pairs that a step uses; the rest count as outliers."""
 BEND_REACH = 0.02
 """Largest distance, m, of a visible vertex from the cloud that it is moved onto."""
-MISFIT, LEAST_MISFIT = 0.035, 0.008
+MISFIT, LEAST_MISFIT = 0.03, 0.008
 """RMS distance of the cloud from a placed mesh that is fine, as a part of the cloud's length, and at least, m. The surface of
-the demo's sloth has 0.018; a box, the sloth on a floor and the sloth beside a ball have 0.048 to 0.065."""
+the demo's sloth has 0.018, in a wrong pose 0.034; a box, the sloth on a floor and the sloth beside a ball have 0.048 to 0.065."""
 LARGEST_RATIO, LOWEST_VERTEX = 1.35, -0.03
 """Length of a mesh over that of the cloud, and height of its lowest vertex, m, that are fine."""
 SEAM = 2e-5

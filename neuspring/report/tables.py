@@ -30,6 +30,7 @@ TONES: dict[str, Tone] = {
     **dict.fromkeys((statistics.ABOVE, statistics.MISSED, "worse", "failed"), "bad"),
 }
 """Verdict -> its color; all others are muted."""
+ARROWS = {"higher": "↑", "lower": "↓", "neither": ""}
 CONDITIONS = ("views", "masks", "backend", "lpips", "failed")
 """Facts of the pictures' scores that tables state."""
 AVERAGED = {"positions": "Errors, mm", "pictures": "Scores of pictures", "marks": "Points marked in images"}
@@ -85,7 +86,7 @@ def pivot(caption: str, cells: pd.DataFrame, index: Mapping[str, str], note: str
         rows.append(
             [*(Cell(text=str(text)) for text in key), *(_cell(own.get((task, metric.name), {})) for task, metric in columns)]
         )
-    heads = [f"{SHORT[task]} {metric.column} {'↑' if metric.higher_is_better else '↓'}" for task, metric in columns]
+    heads = [f"{SHORT[task]} {metric.column} {ARROWS[metric.better]}".rstrip() for task, metric in columns]
     return Table(caption=caption, header=[*index.values(), *heads], rows=rows, note=note, stub=len(index))
 
 
@@ -101,8 +102,8 @@ def texts(cells: pd.DataFrame, text: Callable[[Any, Metric], str]) -> pd.DataFra
 
 
 def best(cells: pd.DataFrame, value: str, by: tuple[str, ...] = ()) -> pd.DataFrame:
-    """The rows with a column `mark`: the best value of each task and metric where there are several."""
-    signs = cells["metric"].map(lambda name: -1.0 if METRICS[name].higher_is_better else 1.0)
+    """The rows with a column `mark`: the best value of each task and metric where there are several and one direction is better."""
+    signs = cells["metric"].map(lambda name: {"higher": -1.0, "lower": 1.0}.get(METRICS[name].better, np.nan))
     key = [cells[name] for name in ("task", "metric", *by)]
     signed = (signs * cells[value]).groupby(key)
     top = (signs * cells[value] == signed.transform("min")) & (signed.transform("count") > 1)
@@ -119,7 +120,7 @@ def ratio_text(row: Any) -> str:
 def change_text(row: Any, metric: Metric, scale: bool = True) -> str:
     """A row of `statistics.changes`: a ratio of errors, a difference of pictures, with its interval."""
     text = metric.text if scale else metric.shown
-    show = "{:.3f}".format if metric.of == "positions" else lambda value: text(value, "+")
+    show = "{:.3f}".format if metric.is_error else lambda value: text(value, "+")
     interval = f" [{show(row.change_low)}, {show(row.change_high)}]" if pd.notna(row.change_low) else ""
     return DASH if pd.isna(row.change) else f"{show(row.change)}{interval}"
 
@@ -180,7 +181,7 @@ def summary_blocks(numbers: Compared) -> list[Block]:
         note = (
             "Errors: geometric mean over objects of paired ratios, seeds averaged within an object; 95 % t interval over objects "
         )
-        note += f"({numbers.objects}), none below {statistics.LEAST_OBJECTS}. Pictures: difference, 95 % bootstrap interval over "
+        note += f"({numbers.objects}), none below {statistics.LEAST_OBJECTS}. Others: difference, 95 % bootstrap interval over "
         note += "scenarios and seeds. All pairs that both methods finished."
         blocks.append(pivot(f"Change against {numbers.name(numbers.baseline)}", shown, {"method": "Method"}, note))
     return blocks

@@ -58,8 +58,8 @@ class Source:
     """True where images lie beside processed data, so that a capture can be made of them for pictures."""
     row_of: Callable[[str], ScenarioRow | None] = lambda name: None
     """The row of a scenario that no table has, where its name says all of it."""
-    required: Callable[[Path], None] = lambda folder: None
-    """Raises InputError where its folder lacks what no run can do without."""
+    required: Callable[[Path], object] = lambda folder: None
+    """Raises InputError where its folder lacks what no run can do without; it reads small files alone."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
     """Names of the cameras before the capture is made. Raises InputError."""
 
@@ -177,6 +177,12 @@ def _required_in_space(folder: Path) -> None:
     read(capture.Capture.load(folder))
 
 
+def _required_raw(folder: Path) -> None:
+    from neuspring.intake.phystwin_raw import read_calibration
+
+    read_calibration(folder)
+
+
 def _counted(folder: Path, config: Config) -> tuple[str, ...]:
     return tuple(map(str, range(phystwin.camera_count(folder))))
 
@@ -207,6 +213,7 @@ SOURCES = Registry(
             films=True,
             write_capture="neuspring.intake.phystwin_raw",
             capture_files=phystwin.RAW_FILES,
+            required=_required_raw,
             cameras=_counted,
         ),
         "phystwin": Source(
@@ -215,6 +222,7 @@ SOURCES = Registry(
             write_capture="neuspring.intake.phystwin_raw",
             files=phystwin.FILES,
             needed=(phystwin.FINAL_DATA, phystwin.SPLIT),
+            required=phystwin.split_and_rate,
             remedy="Bring them: `neuspring fetch phystwin --data-root {data_root} --parts data results images`; or name the folder "
             "above data/different_types: --config data_root=...",
             capture_files=phystwin.RAW_FILES,

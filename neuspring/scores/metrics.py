@@ -57,7 +57,8 @@ class Metric:
     """From the stored unit to that of tables."""
     digits: int
     """After the point, in tables."""
-    higher_is_better: bool = False
+    better: Literal["lower", "higher", "neither"] = "lower"
+    """Values that are better; neither: tables name no best one."""
     relative: bool = True
     """True where a change in per cent means something. It does not in dB."""
     of: Of = "positions"
@@ -84,6 +85,11 @@ class Metric:
     def measure(self, *given: Any) -> Any:
         """Values that the function returns."""
         return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*given)
+
+    @property
+    def is_error(self) -> bool:
+        """True where methods are compared by ratios."""
+        return self.of == "positions" and self.better == "lower"
 
     @property
     def label(self) -> str:
@@ -195,15 +201,15 @@ _ALL = (
     ),
     Metric(
         name="psnr", title="PSNR", heading="PSNR", paper_name="psnr", **_DRAWN | {"unit": "dB"}, shown_unit="dB", digits=3,
-        relative=False, higher_is_better=True, tolerance=0.02, function="neuspring.scores.pictures:psnr_of",
+        relative=False, better="higher", tolerance=0.02, function="neuspring.scores.pictures:psnr_of",
     ),
     Metric(
-        name="ssim", title="SSIM", heading="SSIM", paper_name="ssim", **_DRAWN, digits=4, higher_is_better=True, tolerance=5e-4,
+        name="ssim", title="SSIM", heading="SSIM", paper_name="ssim", **_DRAWN, digits=4, better="higher", tolerance=5e-4,
         function="neuspring.scores.pictures:ssim_of",
     ),
     Metric(
         name="iou", title="IoU", heading="IoU", paper_name="iou", **_DRAWN, shown_unit="%", factor=100.0, digits=1,
-        higher_is_better=True, tolerance=2e-3, function="neuspring.scores.pictures:iou_of",
+        better="higher", tolerance=2e-3, function="neuspring.scores.pictures:iou_of",
     ),
     Metric(
         name="lpips", title="LPIPS", heading="LPIPS", paper_name="lpips", **_DRAWN, digits=4, tolerance=5e-4,
@@ -228,11 +234,11 @@ def metrics_of(of: Of) -> tuple[Metric, ...]:
 
 
 def require_metrics(aims: Iterable[Aim]) -> None:
-    """Raise InputError where an aim names no metric of positions, of which alone there are ratios."""
+    """Raise InputError where an aim names no error, of which alone there are ratios."""
     for aim in aims:
-        known = [metric.name for metric in metrics_of("positions")]
+        known = [metric.name for metric in METRICS.values() if metric.is_error]
         if aim.metric not in known:
-            raise InputError("aims, metric", "must be a metric of positions", aim.metric, f"Known: {', '.join(known)}.")
+            raise InputError("aims, metric", "must be an error of positions", aim.metric, f"Known: {', '.join(known)}.")
 
 
 def errors_per_frame(positions: np.ndarray, observations: Observations, of: Of = "positions") -> dict[str, np.ndarray]:

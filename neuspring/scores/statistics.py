@@ -23,8 +23,8 @@ import numpy as np
 import pandas as pd
 
 from neuspring.config.settings import Aim
-from neuspring.scores.metrics import metrics_of
-from neuspring.scores.table import of_kind, stacked
+from neuspring.scores.metrics import METRICS
+from neuspring.scores.table import stacked
 
 RESAMPLES = 10_000
 
@@ -102,7 +102,7 @@ def ratios(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -
     counts objects. Interval and verdict are NaN and "too few objects" below three objects. There is no row where an error is zero.
     """
     rows = []
-    names = [metric.name for metric in metrics_of("positions")]
+    names = [metric.name for metric in METRICS.values() if metric.is_error]
     for (task, metric), part in scores[scores["metric"].isin(names)].groupby(["task", "metric"], sort=False):
         wide = part.pivot_table(index=["category", "scenario", "seed"], columns="method", values="value")
         if baseline not in wide:
@@ -164,10 +164,10 @@ def judged_aims(scores: pd.DataFrame, aims: Iterable[Aim], objects: Objects = "s
 def changes(scores: pd.DataFrame, baseline: str, objects: Objects = "scenario") -> pd.DataFrame:
     """A row per method, task and metric: `change` against the baseline with `change_low`, `change_high`, `n`, `verdict`.
 
-    Errors have their ratio (`ratios`); pictures and marks have the difference (`paired_differences`), without a verdict.
+    Errors have their ratio (`ratios`); all others have the difference (`paired_differences`), without a verdict.
     """
     errors = ratios(scores, baseline, objects)
-    others = paired_differences(of_kind(scores, "pictures", "marks"), baseline)
+    others = paired_differences(scores[~scores["metric"].map(lambda name: METRICS[name].is_error).astype(bool)], baseline)
     names = ["change", "change_low", "change_high", "n"]
     tables = [
         errors.rename(columns=dict(zip(("ratio", "ratio_low", "ratio_high"), names, strict=False))),

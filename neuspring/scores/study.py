@@ -99,7 +99,7 @@ def _verdict(found: dict[str, Any], printed: Printed | None, metric: Metric, for
         return "other data" if printed else "not in the paper"
     slack = printed.slack + ROUND_OFF * abs(printed.value)
     low, high = (found[name] if np.isfinite(found[name]) else found["ours"] for name in ("low", "high"))
-    verdict = "better" if (found["ours"] > printed.value) == metric.higher_is_better else "worse"
+    verdict = "better" if (found["ours"] > printed.value) == (metric.better == "higher") else "worse"
     verdict = "within" if low - slack <= printed.value <= high + slack else verdict
     counted, everyone = found["scenarios"], len(paper.scenarios())
     return verdict if counted >= everyone else f"partial ({counted} of {everyone}): {verdict}"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.config import Config
+from neuspring.config.twin import TERMS
 from neuspring.core.artifacts import Artifact, Observations, Twin
 from neuspring.registry import Registry, modules
 
@@ -220,13 +221,6 @@ def _tried(function: Callable[..., Learned], *arguments: Any, **options: Any) ->
 
 
 BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "body"), type=Body)
-
-
-TERMS: Registry[Any] = Registry(
-    "losses", {name: f"neuspring.twin.losses:{name}" for name in ("chamfer", "track", "acceleration", "image_track", "silhouette")}
-)
-"""Every term of the training loss, by the name of its weight: a function of a `FrameLoss` and a `FrameState` that returns the
-weighted loss, or None where it does not apply."""
 
 
 def code(*bodies: str) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""The training loss, in one place: a term is a function that returns its weighted loss of a frame.
+"""The training loss, in one place: a term is a function that returns its loss of a frame.
 
-A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; `config.Losses` has the weight under its name:
+A term's loss is the sum of s(e)^2 over its errors e, m, divided by their number; `config.Losses` has its weight under its name:
 
     chamfer       e from each visible observed point to its nearest surface node (assignment fixed), s(e) = e
     track         e from track i to node i where the motion is valid, s(e)^2 smooth-L1 (beta = 1 m)
@@ -12,7 +12,7 @@ A term's loss is weight / divisor times the sum of s(e)^2 over its errors e, m; 
 The last two are of one camera without depth, with the projection u(x) = K R^T (x - c) / depth, pixels, and p, m per pixel at the
 object in frame 0. The first three are those of the released PhysTwin code. The fit takes `FrameLoss.__call__`. The search takes the
 first three on the lanes of its solver (trials.py, tested against this file) and what else there is from here: a term needs its
-function, its name in `body.TERMS`, and its weight.
+function and, in `config.Losses`, its weight; a package brings the function by an entry point of the group `neuspring.losses`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import torch
 from torch.nn.functional import grid_sample, smooth_l1_loss
 
 from neuspring.config import Losses
+from neuspring.config.twin import TERMS
 from neuspring.core.artifacts import Observations
-from neuspring.twin.body import TERMS
 
 CHUNK_ENTRIES = 1 << 22
 """Distances computed at once in the nearest-node search; bounds memory."""
@@ -56,9 +56,9 @@ def _smooth_root(e: torch.Tensor) -> torch.Tensor:
     return torch.where(size < BETA, e / 2**0.5, e.sign() * linear)
 
 
-def _mean_square(s: torch.Tensor, weight: float, count: torch.Tensor | int) -> torch.Tensor:
-    """weight / count times the sum of the squares of s [k, d]; the count is at least 1."""
-    scale = weight / torch.as_tensor(count, dtype=s.dtype, device=s.device).clamp_min(1)
+def _mean_square(s: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
+    """The sum of the squares of s [k, d] over the count, which is at least 1."""
+    scale = 1.0 / torch.as_tensor(count, dtype=s.dtype, device=s.device).clamp_min(1)
     return (s * scale.sqrt()).square().sum()
 
 
@@ -93,19 +93,19 @@ def chamfer(loss: FrameLoss, state: FrameState) -> torch.Tensor:
     """From visible points to nearest surface nodes, over the points that are visible."""
     points = loss.points[state.frame][loss.visible[state.frame]]
     e = state.x[nearest(points, state.x.detach()[: loss.surface])] - points
-    return loss.weights.chamfer * (e.square().sum() / max(loss.counts[state.frame][0], 1))
+    return e.square().sum() / max(loss.counts[state.frame][0], 1)
 
 
 def track(loss: FrameLoss, state: FrameState) -> torch.Tensor:
     """From tracks to their nodes, over valid tracks and axes. Frame t uses the validity of t - 1."""
     target, valid = loss.points[state.frame], loss.motion_valid[state.frame - 1]
     e = state.x[: len(target)][valid] - target[valid]
-    return loss.weights.track * (_smooth_l1(e) / (3 * max(loss.counts[state.frame][1], 1)))
+    return _smooth_l1(e) / (3 * max(loss.counts[state.frame][1], 1))
 
 
 def acceleration(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     """Smoothness of motion, over nodes and axes."""
-    return None if state.jerk is None else loss.weights.acceleration * (_smooth_l1(state.jerk) / state.jerk.numel())
+    return None if state.jerk is None else _smooth_l1(state.jerk) / state.jerk.numel()
 
 
 def image_track(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
@@ -115,7 +115,7 @@ def image_track(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
         return None
     seen = image.visible[state.frame]
     e = image.size * (u[: len(seen)] - image.pixels[state.frame])
-    return _mean_square(_smooth_root(e * seen[:, None]), loss.weights.image_track, 2 * seen.sum())
+    return _mean_square(_smooth_root(e * seen[:, None]), 2 * seen.sum())
 
 
 def silhouette(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
@@ -128,8 +128,7 @@ def silhouette(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     near = torch.cdist(points, image.project(state.x.detach()[: loss.surface])).argmin(dim=1)
     away = image.size * (u[near] - points) * inside[:, None]
     left = image.size * image.distance(state.frame, u)[:, None]
-    weight = loss.weights.silhouette
-    return _mean_square(away, weight, inside.sum()) + _mean_square(left, weight, len(u))
+    return _mean_square(away, inside.sum()) + _mean_square(left, len(u))
 
 
 OF_IMAGES = ("image_track", "silhouette")
@@ -243,7 +242,7 @@ class FrameLoss:
     def names(self) -> tuple[str, ...]:
         """Terms that count: those with a weight, those of images where there are any."""
         there = [name for name in TERMS if self.image is not None or name not in OF_IMAGES]
-        return tuple(name for name in there if getattr(self.weights, name, 1.0))
+        return tuple(name for name in there if getattr(self.weights, name))
 
     def terms(
         self, frame: int, x: torch.Tensor, jerk: torch.Tensor | None = None, without: Collection[str] = ()
@@ -251,7 +250,7 @@ class FrameLoss:
         """Weighted losses of a frame >= 1 by term, for nodes x [N, 3], m; terms named in `without` are left out."""
         state = FrameState(frame, x, jerk, self.image.project(x) if self.image else None)
         found = {name: TERMS[name](self, state) for name in self.names if name not in without}
-        return {name: value for name, value in found.items() if value is not None}
+        return {name: getattr(self.weights, name) * value for name, value in found.items() if value is not None}
 
     def __call__(self, frame: int, x: torch.Tensor) -> torch.Tensor:
         """The sum of a frame's terms, without acceleration."""

@@ -18,6 +18,7 @@ from neuspring.config import Config, Method, parse
 from neuspring.core.errors import InputError
 from neuspring.core.records import Before, Recorder
 from neuspring.experiments import benchmark as tables
+from neuspring.experiments import plan
 from neuspring.experiments.benchmark import Benchmark
 from neuspring.experiments.graph import Graph, behind
 from neuspring.scenes.sources import SOURCES, read_scenarios, scenario_rows
@@ -240,7 +241,7 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
         ({"only": "seed"}, "terms scenario="),
         (
             {"aims": [{"method": "long", "baseline": "full", "metric": "chanfer", "ratio": 0.9}]},
-            r"aims, metric: must be a metric of positions.*Known: chamfer",
+            r"aims, metric: must be an error of positions.*Known: chamfer",
         ),
         ({"transfers": {"rope": []}}, r"transfers\.rope: other scenarios, each once, are required, received \[\]"),
         ({"transfers": {"rope": ["rope"]}}, r"transfers\.rope: other scenarios"),
@@ -430,7 +431,7 @@ def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
         needed = [tmp_path / row.path / file for file in SOURCES[row.source].needed] or [tmp_path / row.path]
         for path in needed if row.source not in ("capture", "synthetic", "toy") else ():
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
+            path.write_text('{"train": [0, 5], "test": [5, 9]}')
     for name in values["scenarios"] if data == "film22" else ():
         paint(tmp_path / name, frames=5)
     for cable in values.get("deform", {}).get("cables", ()):
@@ -443,6 +444,32 @@ def test_every_configuration_that_is_shipped_is_valid(data, studies, tmp_path):
     benchmark = Benchmark(values, ROOT)
     assert benchmark.compared_with in benchmark.methods
     assert set(Graph(benchmark).owners["fit"]) >= {name for name, row in benchmark.methods.items() if row.fit}
+
+
+def test_a_plan_reads_the_small_files_of_cases_and_says_which_large_ones_exist(tmp_path):
+    names = ["single_lift_sloth", "double_lift_sloth", "single_lift_rope"]
+    values = {**shipped("phystwin"), "scenarios": names, "data_root": str(tmp_path)}
+    for name in names:
+        folder = tmp_path / "data" / "different_types" / name
+        folder.mkdir(parents=True)
+        write(folder / "final_data.pkl", "a text")
+        write(folder / "split.json", "{}")
+
+    def planned():
+        graph = Graph(Benchmark(values, ROOT, plan_only=True))
+        return plan.told(graph, graph.runs(), [], gpus=["0"], cores=1, cluster=False)
+
+    with pytest.raises(InputError, match=r"3 of 3 scenarios must exist.*split\.json: train: whole numbers .*received \{\}"):
+        Benchmark(values, ROOT)
+    assert "missing  single_lift_sloth, double_lift_sloth, single_lift_rope: the data of 3 of 3" in planned()
+    for name in names:
+        write(folder.parent / name / "split.json", '{"train": [0, 5], "test": [5, 9]}')
+    write(folder / "metadata.json", '{"fps": "fast"}')
+    assert re.search(r"missing  \S+single_lift_rope/metadata\.json: fps or record_hz: a positive number", planned())
+    (folder.parent / names[0] / "final_data.pkl").unlink()
+    assert "missing  single_lift_sloth, single_lift_rope: the data of 2 of 3 scenarios must exist" in planned()
+    (folder / "metadata.json").unlink()
+    assert "data     final_data.pkl of 2 scenarios exists; only jobs read it" in planned()
 
 
 EXTRA = sorted((ROOT / "config" / "rows").glob("*.yaml"))

@@ -9,10 +9,11 @@ import pytest
 from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.findings import broken, note, unusual
-from neuspring.intake import check
+from neuspring.intake import check, phystwin_raw
 from neuspring.intake.check import Layout, check_layout, render
 from neuspring.registry import Registry
 from tests.support.c3d_files import write_c3d
+from tests.support.filmed import film, write_raw
 from tests.support.findings import holds, of_level, serious
 from tests.support.phystwin_case import dump, stored, write_case, write_json
 
@@ -47,10 +48,14 @@ def of_pickle(name, value):
 
 FAULTS = [
     (of_data(put("object_points", (3, 0, 0), np.nan)), "final_data.pkl", "object_points: every coordinate must be finite"),
-    (of_data(put("object_visibilities", (0, 5), False)), "final_data.pkl", "visible in frame 0"),
-    (of_data(trust_hidden), "final_data.pkl", "visible in both frames"),
-    (of_data(put("object_points", (slice(None), slice(None), 2), 0.1)), "final_data.pkl", "up is -z"),
-    (of_data(lambda d: d | {"controller_points": d["controller_points"][:, :0]}), "final_data.pkl", "at least one controller"),
+    (of_data(put("object_visibilities", (0, 5), False)), "final_data.pkl", "hidden in frame 0.* received 1"),
+    (of_data(trust_hidden), "final_data.pkl", "where its point is hidden.* received 1"),
+    (of_data(put("object_points", (slice(None), slice(None), 2), 0.1)), "final_data.pkl", "up is -z.* received 0.1"),
+    (
+        of_data(lambda d: d | {"controller_points": d["controller_points"][:, :0]}),
+        "final_data.pkl",
+        "controller point is required; received none",
+    ),
     (of_data(lambda d: d | {"surface_points": d["surface_points"][:, :2]}), "final_data.pkl", "surface_points"),
     (of_data(lambda d: d | {"object_motions_valid": d["object_motions_valid"][1:]}), "final_data.pkl", "object_motions_valid"),
     (of_data(lambda d: d | {"interior_points": "text"}), "final_data.pkl", "received str"),
@@ -83,6 +88,30 @@ def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_
     for name in ("gt_track_3d.pkl", "calibrate.pkl", "metadata.json"):
         (folder / name).unlink()
     assert serious(check_layout(folder)) == []
+
+
+RAW_FAULTS = {
+    "mask/mask_info_1.json": ({"0": "toy", "1": "Hand"}, "exactly one detection must not be 'hand'"),
+    "mask/mask_info_0.json": ({"cam_idx": 0}, "Name these folders: 0, 1"),
+    "metadata.json": ({"intrinsics": [K] * 2, "frame_num": 2, "fps": 15}, "WH: two positive"),
+    "split.json": ({"train": [0, 1]}, "train: whole numbers"),
+    "depth/1/0.npy": (np.zeros((90, 160), np.float32), "depth must be 16-bit counts; received float32"),
+}
+
+
+@pytest.mark.parametrize("file", [None, *RAW_FAULTS])
+def test_a_raw_case_of_two_cameras_is_checked_by_the_reader_of_its_capture(tmp_path, file):
+    case = write_raw(film(tmp_path / "capture", cameras=2, up="-z"), tmp_path / "case")
+    if file is None:
+        assert render(check_layout(case)) == "0 errors, 0 warnings"
+        return
+    value, words = RAW_FAULTS[file]
+    np.save(case / file, value) if file.endswith("npy") else write_json(case / file, value)
+    (found,) = of_level(check_layout(case), "error")
+    with pytest.raises(InputError) as error:
+        phystwin_raw.convert("a", "toy", case, tmp_path / "converted")
+    assert words in found and found.partition(": ")[2] == str(error.value).partition(": ")[2]
+    assert not (tmp_path / "converted").exists()
 
 
 def test_a_case_a_folder_of_cases_and_a_root(tmp_path):

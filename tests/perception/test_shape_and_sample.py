@@ -1,7 +1,10 @@
 """The visual hull of known bodies, alignment of meshes, and structure points one per voxel."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -11,8 +14,9 @@ from neuspring.core.errors import InputError
 from neuspring.data.capture import HANDS
 from neuspring.data.results import Masks, ShapePrior
 from neuspring.perception import shape
-from neuspring.perception.sample import assemble, inside, structure, voxel_for
-from neuspring.scenes.shapes import capsule, smooth_union, sphere
+from neuspring.perception.sample import assemble, inside, on_surface, structure, voxel_for
+from neuspring.scenes.shapes import capsule, ellipsoid, smooth_union, sphere
+from tests.support.filmed import surface
 from tests.support.still import overlap, still, tracked
 
 BODY = smooth_union([sphere((0, 0, 0.06), 0.05), capsule((0, 0, 0.06), (0.1, 0, 0.04), 0.03)], 0.005)
@@ -62,6 +66,67 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place_wherever_the_object_lies(tm
     placed, rms = shape.place(other, truth.faces, cloud + far)
     assert rms < 0.003
     assert overlap(ShapePrior(vertices=placed - far, faces=truth.faces, backend="mesh"), truth) > 0.9
+
+
+@pytest.fixture(scope="module")
+def toy() -> trimesh.Trimesh:
+    """A flat animal with arms and legs, 0.3 m long, on the table z = 0: a closed surface."""
+    parts = [ellipsoid((0, 0, 0.05), (0.085, 0.06, 0.045)), ellipsoid((0.12, 0, 0.06), (0.05, 0.05, 0.042))]
+    for side in (1, -1):
+        parts.append(capsule((0.05, 0.045 * side, 0.035), (0.11, 0.125 * side, 0.022), 0.02))
+        parts.append(capsule((-0.055, 0.04 * side, 0.032), (-0.12, 0.1 * side, 0.022), 0.021))
+    vertices, faces = surface(smooth_union(parts, 0.01), (-0.2, -0.2, -0.02), (0.2, 0.2, 0.13), 0.008)
+    return trimesh.Trimesh(vertices, faces)
+
+
+def test_seams_that_rounding_opened_are_joined(toy, tmp_path):
+    soup = trimesh.Trimesh(toy.triangles.reshape(-1, 3), np.arange(3 * len(toy.faces)).reshape(-1, 3), process=False)
+    soup.vertices = soup.vertices + 1e-6 * np.random.default_rng(0).normal(size=soup.vertices.shape)
+    soup.export(tmp_path / "seams.ply")
+    vertices, faces = shape.read_mesh(tmp_path / "seams.ply")
+    assert closed(faces) and 0.99 * len(toy.vertices) < len(vertices) <= len(toy.vertices)
+
+
+def inverted(toy: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(toy.vertices, toy.faces[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "words"),
+    [
+        ("draco.glb", lambda toy: b'glTF {"extensionsRequired": ["KHR_draco_mesh_compression"]}', "Unpack it: npx"),
+        ("both.ply", lambda toy: trimesh.util.concatenate([toy, inverted(toy)]).export(file_type="ply"), "Export one side"),
+        ("open.ply", lambda toy: toy.submesh([np.arange(99)], append=True).export(file_type="ply"), "the surface must be closed"),
+        ("points.ply", lambda toy: trimesh.PointCloud(toy.vertices).export(file_type="ply"), "at least one triangle"),
+    ],
+)
+def test_files_without_one_closed_surface_are_refused(toy, tmp_path, name, write, words):
+    (tmp_path / name).write_bytes(write(toy))
+    with pytest.raises(InputError, match=words):
+        shape.read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("kind", "start", "fits"),
+    [("own", 0, True), ("own", 180, False), ("floor", 0, False), ("ball", 0, False), ("long", 0, False), ("sunk", 0, False)],
+)
+def test_a_mesh_must_fit_what_was_seen(toy, kind, start, fits):
+    """Alone in its pose; upside down; on a floor; beside a ball; with a tail; below the table."""
+    rng = np.random.default_rng(0)
+    seen = on_surface(toy.vertices, toy.faces[toy.face_normals[:, 2] > 0], shape.COMPARED_SURFACE, rng)
+    floor, ball = trimesh.creation.box((0.5, 0.5, 0.01)), trimesh.creation.icosphere(3, 0.06)
+    ball.apply_translation((0.37, 0, 0.06))
+    mesh = trimesh.util.concatenate([toy, *{"floor": [floor], "ball": [ball]}.get(kind, [])])
+    source = on_surface(mesh.vertices, mesh.faces, shape.COMPARED_SURFACE, rng)
+    center = source.mean(axis=0)
+    turn = Rotation.from_euler("x", start, degrees=True)
+    rms, turn, size, shift = shape._icp(source - center, seen, turn, 1.0, seen.mean(axis=0), shape.ITERATIONS)
+    placed = size * turn.apply(mesh.vertices - center) + shift
+    placed *= [1.5 if kind == "long" else 1.0, 1, 1]
+    placed -= [0, 0, 0.05 if kind == "sunk" else 0.0]
+    said = nullcontext() if fits else pytest.raises(InputError, match="the mesh must fit what was seen: RMS distance at most 9 mm")
+    with said:
+        shape.require_fit("mesh.ply", placed, rms, seen, 1.0)
 
 
 def test_bending_brings_the_visible_part_to_where_it_was_seen(tmp_path):

@@ -1,6 +1,7 @@
 """Tables say who is ahead and whether that is resolved, compare like with like, and hide no gap."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from neuspring.report.tables import (
     write,
 )
 from neuspring.scores import statistics
+from neuspring.scores.metrics import METRICS
 from neuspring.scores.statistics import paired_differences, resampled_means
 from neuspring.scores.table import ScoreTable, collect, read_scores
 from tests.support.runs import run_record
@@ -72,6 +74,18 @@ def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
     }
     assert "Averages take the 1 of 2 pairs" in markdown(summary_blocks(numbers))
     assert {row["Method"].text for row in rows_of(failure_blocks(numbers)[-1]).values()} == {"y", "z"}
+
+
+@pytest.mark.parametrize(("better", "heading", "marked"), [("higher", "Future TE ↑", ["x"]), ("neither", "Future TE", [])])
+def test_the_direction_of_a_metric_decides_what_is_best_and_only_errors_have_ratios(better, heading, marked, monkeypatch):
+    monkeypatch.setitem(METRICS._loaded, "track_error", replace(METRICS["track_error"], better=better))
+    values = {(scenario, m, 0): error for scenario in "abc" for m, error in (("x", 0.010), ("y", 0.008))}
+    found = tables_in(summary_blocks(benchmark(values, baseline="x")))
+    for caption in ("Errors, mm", "Per scenario"):
+        assert {name for name, row in rows_of(found[caption]).items() if row[heading].mark} <= {*marked, *"abc"}
+    assert [name for name, row in rows_of(found["Errors, mm"]).items() if row[heading].mark] == marked
+    (change,) = rows_of(found["Change against x"]).values()
+    assert change[heading].text.startswith("-2.00 [") and not change[heading].tone
 
 
 def test_changes_breakdowns_and_pictures_have_tables():

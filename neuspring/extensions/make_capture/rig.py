@@ -35,7 +35,7 @@ KEYS = (
     ("Record3D metadata.json", "K (by columns), w h", "fx = K[0], fy = K[4], cx = K[6], cy = K[7], width height, depth_unit 1"),
     (
         "OpenCV",
-        "camera_matrix, dist_coeffs, rvec tvec",
+        "camera_matrix (_3x3), dist_coeffs (_array), rvec tvec",
         "fx fy cx cy, distortion, pose [Rodrigues(rvec) tvec] with world_to_camera",
     ),
     (
@@ -126,8 +126,8 @@ def read_rig(path: Path | None) -> StatedRig:
         return parse(StatedRig, values, str(path))
     except InputError as error:
         rows = "".join(f"\n  {program}: {theirs} -> {ours}" for program, theirs, ours in KEYS)
-        told = str(error).partition("\nSee config")[0]
-        raise InputError(told, f"\nrig.json has keys of its own ({__name__}). Keys of other programs become{rows}") from error
+        told = str(error).partition(". \nSee config")[0]
+        raise InputError(told, f"rig.json has keys of its own ({__name__}). Keys of other programs become{rows}") from error
 
 
 def stated(path: Path | None, key: str, value: Any, camera: str = "") -> Any:

@@ -63,12 +63,32 @@ def test_its_command_formats_and_captures_are_there(installed, tmp_path):
     assert f"{FRAMES} frames" in said and (tmp_path / "capture" / "capture.json").exists()
 
 
+TERM = """
+from neuspring.config import Config, parse
+from neuspring.scores.metrics import METRICS
+for given in ({}, {"above_table": 2.0}, {"above_table": 0.0}, {"below": 1.0}):
+    try:
+        losses = parse(Config, {"losses": given}, "configuration").losses
+        print(losses.above_table)
+    except ValueError as error:
+        print(error.args[0].replace("\\n", " "))
+print(METRICS["sag"].better, METRICS["sag"].is_error)
+"""
+
+
+def test_the_weight_of_its_loss_is_a_setting_and_its_metric_has_no_best_value(installed):
+    command = [sys.executable, "-c", TERM]
+    said = subprocess.run(command, env=os.environ | installed, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert said[:3] == ["0.0", "2.0", "0.0"] and said[-1] == "neither False"
+    assert "losses.below" in said[3]
+
+
 @pytest.mark.slow
 def test_its_baseline_metric_section_and_export_go_through_the_whole_workflow(installed, tmp_path):
     copy = project.copy_workflow(tmp_path / "project")
     methods = copy / "config" / "methods.yaml"
     methods.write_text(methods.read_text() + METHOD)
-    project.run(copy, {"methods": ["visiting", "search_only"]}, **installed)
+    project.run(copy, {"methods": ["visiting", "search_only"], "losses": {"above_table": 1.0}}, **installed)
     summary = (copy / "results" / "tables" / "summary.md").read_text()
     assert "Sag" in summary and "visiting" in summary
     assert "A visitor was here." in (copy / "results" / "tables" / "report.html").read_text()

@@ -17,6 +17,7 @@ PLAIN = {"fx": 407.25, "fy": 407.25, "cx": 211.5, "cy": 119.5}
 POSE = np.linalg.inv(camera().camera_to_world)
 OTHERS = {
     "open3d": {"width": 424, "height": 240, "intrinsic_matrix": [407.25, 0, 0, 0, 407.25, 0, 211.5, 119.5, 1]},
+    "opencv": {"cameras": [{"camera_matrix_3x3": K.tolist(), "dist_coeffs_array": [0.1, 0, 0, 0, 0]}]},
     "numbers as text": {"cameras": [{key: str(value) for key, value in PLAIN.items()}]},
     "nerfstudio": {"fl_x": 407.25, "frames": [{"transform_matrix": POSE.tolist()}]},
     "flat pose": {"cameras": [{"pose": POSE.ravel().tolist()}]},
