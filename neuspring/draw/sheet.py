@@ -111,7 +111,7 @@ def color_bar(axes: Iterable[Axes], norm: Normalize, colors: str, label: str, ex
 
 
 def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:
-    """Indices, ascending, of the springs to draw: all of them, or a random `most` that is the same every time."""
+    """Indices, ascending, of the springs or splats to draw: all of them, or a random `most` that is the same every time."""
     if count <= most:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))

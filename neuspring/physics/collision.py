@@ -419,64 +419,51 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
         return scaled(hn - scaled(n, dot(hn, n)), inverse), hu, he, hmu
 
     @wp.func
+    def mean_adjoint(state: State, adjoint: Adjoint, step: int, i: int, g: int) -> Vector:
+        """The adjoint of the mean impulse of node i."""
+        return divided(adjoint.moving[i, g], wp.max(state.met[step, i, g], whole(one)))
+
+    @wp.func
     def add_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int, j: int, mask: int, own: Vector):
-        """Add to the adjoints of x and velocities of a pair, `own` being that of the mean impulse of i; return those of e, mu."""
+        """Add to the adjoints of x and velocities of a pair, and of e and mu; `own` is that of the mean impulse of i."""
         offset = state.x[step, j, g] - state.x[step, i, g]
         relative = state.after[step, j, g] - state.after[step, i, g]
         light = model.inverse_mass[i, g]
         beside = model.inverse_mass[j, g]
         meets = meeting(offset, relative, model.bits[mask, g], model.distance[g])
-        other = divided(adjoint.moving[j, g], wp.max(state.met[step, j, g], whole(one)))
+        other = mean_adjoint(state, adjoint, step, j, g)
         share = scaled(other, part(model, beside, light)) - scaled(own, part(model, light, beside))
         hx, hu, he, hmu = pair_adjoint(offset, relative, model.contact_e[g], model.contact_mu[g], scaled(share, meets))
         wp.atomic_add(adjoint.x, j, g, hx)
         wp.atomic_sub(adjoint.x, i, g, hx)
         wp.atomic_add(adjoint.after, j, g, hu)
         wp.atomic_sub(adjoint.after, i, g, hu)
-        return he, hmu
+        adjoint.contact_e[i, g] = adjoint.contact_e[i, g] + he
+        adjoint.contact_mu[i, g] = adjoint.contact_mu[i, g] + hmu
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu)."""
-        h = adjoint.moving[i, g]
-        wp.atomic_add(adjoint.after, i, g, h)
-        count = state.met[step, i, g]
-        if wp.max(count) == zero:
+        wp.atomic_add(adjoint.after, i, g, adjoint.moving[i, g])
+        if wp.max(state.met[step, i, g]) == zero:
             return
         x = state.x[step, i, g]
         v = state.after[step, i, g]
-        own = divided(h, wp.max(count, whole(one)))
-        e = adjoint.contact_e[i, g]
-        mu = adjoint.contact_mu[i, g]
+        own = mean_adjoint(state, adjoint, step, i, g)
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
             if j > i and closes(state.x[step, j, g] - x, state.after[step, j, g] - v):
-                he, hmu = add_adjoint(model, state, adjoint, step, i, g, j, model.near_lanes[i, k, g], own)
-                e = e + he
-                mu = mu + hmu
-        adjoint.contact_e[i, g] = e
-        adjoint.contact_mu[i, g] = mu
+                add_adjoint(model, state, adjoint, step, i, g, j, model.near_lanes[i, k, g], own)
 
     @wp.func
     def add_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """The same by one thread for all."""
-        h = adjoint.moving[i, g]
-        wp.atomic_add(adjoint.after, i, g, h)
-        count = state.met[step, i, g]
-        if wp.max(count) == zero:
+        wp.atomic_add(adjoint.after, i, g, adjoint.moving[i, g])
+        if wp.max(state.met[step, i, g]) == zero:
             return
-        x = state.x[step, i, g]
-        v = state.after[step, i, g]
-        own = divided(h, wp.max(count, whole(one)))
-        e = adjoint.contact_e[i, g]
-        mu = adjoint.contact_mu[i, g]
-        for place in range(closing_pairs(model, state, step, step, i, g, x, v)):
+        own = mean_adjoint(state, adjoint, step, i, g)
+        for place in range(closing_pairs(model, state, step, step, i, g, state.x[step, i, g], state.after[step, i, g])):
             k = plain(model.closing[g, plain(place)])
-            j = plain(model.pair_other[g, k])
-            he, hmu = add_adjoint(model, state, adjoint, step, i, g, j, model.pair_lanes[g, k], own)
-            e = e + he
-            mu = mu + hmu
-        adjoint.contact_e[i, g] = e
-        adjoint.contact_mu[i, g] = mu
+            add_adjoint(model, state, adjoint, step, i, g, plain(model.pair_other[g, k]), model.pair_lanes[g, k], own)
 
     return collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint

@@ -177,17 +177,14 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
         state.moving[inner, i, g] = moving
         advance(model, state, step, i, g, moving)
 
-    def settle(model: Model, state: State, adjoint: Adjoint, step: int):
-        i, g = wp.tid()
-        settled(model, state, adjoint, step, i, g)
+    def of_node(adjoint_of_node: Any) -> Any:
+        """The kernel that calls an adjoint for each node."""
 
-    def hit(model: Model, state: State, adjoint: Adjoint, step: int):
-        i, g = wp.tid()
-        collided_adjoint(model, state, adjoint, step, i, g)
+        def kernel(model: Model, state: State, adjoint: Adjoint, step: int):
+            i, g = wp.tid()
+            adjoint_of_node(model, state, adjoint, step, i, g)
 
-    def slow(model: Model, state: State, adjoint: Adjoint, step: int):
-        i, g = wp.tid()
-        update_adjoint(model, state, adjoint, step, i, g)
+        return kernel
 
     def pull(model: Model, state: State, adjoint: Adjoint, step: int):
         i, g = wp.tid()
@@ -196,4 +193,5 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
             settled(model, state, adjoint, step - 1, i, g)
 
     made = wp.kernel(**UNFUSED)
+    settle, hit, slow = map(of_node, (settled, collided_adjoint, update_adjoint))
     return Kernels(*map(made, (forward, backward, begin, substep, collide, settle, pull, hit, slow)))

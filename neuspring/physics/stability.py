@@ -80,6 +80,21 @@ def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float)
     return int(frame_time / spectrum.largest_substep(safety)) + 1
 
 
+def needed_substeps(twin: Twin, safety: float) -> int:
+    """The same for a twin at rest."""
+    return smallest_safe_substeps(twin_spectrum(twin), twin.simulation.frame_time, safety)
+
+
+def with_substeps(twin: Twin, count: int) -> Twin:
+    """The twin with so many substeps per frame."""
+    return replace(twin, simulation=replace(twin.simulation, substeps=count))
+
+
+def stable(twin: Twin, safety: float) -> Twin:
+    """The twin with at least as many substeps as a part `safety` of the stability bound asks for."""
+    return with_substeps(twin, max(needed_substeps(twin, safety), twin.simulation.substeps))
+
+
 def for_prediction(twin: Twin) -> Twin:
     """A lattice as predictions are made with it: where the body can meet itself, with substeps for `PREDICTION`.
 
@@ -90,8 +105,7 @@ def for_prediction(twin: Twin) -> Twin:
     simulation = twin.simulation
     if not simulation.self_collision or simulation.frame_time == RELEASED_FRAME_TIME:
         return twin
-    count = smallest_safe_substeps(twin_spectrum(twin), simulation.frame_time, PREDICTION)
-    return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
+    return stable(twin, PREDICTION)
 
 
 def check(twin: Twin) -> None:

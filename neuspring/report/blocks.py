@@ -55,11 +55,9 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """Preformatted text."""
+    """Preformatted text; a click selects all of it, to be copied."""
 
     text: str
-    whole: bool = False
-    """A click selects all of it, to be copied."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +90,7 @@ class PageSection:
     """A part of the page with an entry in its table of contents."""
 
     key: str
+    """Its name in the registry, and in links to it."""
     title: str
     blocks: Sequence[Block]
     about: str = ""

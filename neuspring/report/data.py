@@ -20,7 +20,7 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.job_records import JobRecord
 from neuspring.core.run_record import RUN_RECORD, RunRecord
-from neuspring.report.blocks import PageSection, Picture
+from neuspring.report.blocks import Block, Picture
 from neuspring.report.tables import Compared
 from neuspring.scores.paper import Study
 from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
@@ -165,8 +165,11 @@ class ReportSection:
 
     order: int
     """Its position on the page, by tens; behind 30 it is folded."""
-    make: Callable[[ReportData], PageSection | None]
-    """None where there is nothing to show."""
+    title: str
+    make: Callable[[ReportData], Sequence[Block]]
+    """Its blocks; none where there is nothing to show."""
+    about: str = ""
+    """A sentence below the title."""
     phase: Literal[0, 1, 2] = 0
     """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
 

@@ -6,6 +6,7 @@ read.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from neuspring.core.job_records import asked, read_jobs
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
-from neuspring.report.blocks import PageSection, html_page
+from neuspring.report.blocks import Block, PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, traces
 from neuspring.report.tables import Compared, several
 from neuspring.scores.table import as_asked, collect
@@ -38,21 +39,20 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
         raise InputError(results, "the results folder must exist", "no such folder", "Run the workflow first, or name another.")
     material, written = gather(results, Path(output), options), written or now()
     choice = material.choice
-    counts = [
-        several(len(choice.scenarios), "scenario"),
-        several(len(choice.methods), "method"),
-        several(len(choice.seeds), "seed"),
-    ]
+    counts = [several(len(getattr(choice, f"{noun}s")), noun) for noun in ("scenario", "method", "seed")]
     subtitle = f"{', '.join(counts)}; {results.resolve().name}."
     ordered = sorted(REPORT_SECTIONS.items(), key=lambda pair: (pair[1].order, pair[0]))
-    made: dict[str, PageSection | None] = {}
+    made: dict[str, Sequence[Block]] = {}
 
     def make(phase: int) -> None:
         made.update({name: section.make(material) for name, section in ordered if section.phase == phase})
 
     def page() -> str:
-        there = [(one.order, section) for name, one in ordered if (section := made.get(name))]
-        sections = [replace(section, folded=order > LAST_OPEN) for order, section in there]
+        sections = [
+            PageSection(key=name, title=one.title, blocks=blocks, about=one.about, folded=one.order > LAST_OPEN)
+            for name, one in ordered
+            if (blocks := made.get(name))
+        ]
         return html_page("NeuSpring: report", subtitle, sections, written=written)
 
     # Pictures take the room that all else leaves. What lists damaged files is made again last: pictures may be damaged too.

@@ -195,8 +195,8 @@ def _content(folder: Path) -> str:
     return ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder"
 
 
-def require_modest(path: Path, most: int = MOST_BYTES) -> None:
-    """Raise InputError for an `.npz` file whose arrays would not fit `most` bytes, or whose headers promise more than it holds."""
+def require_modest(path: Path) -> None:
+    """Raise InputError for an `.npz` file whose arrays would not fit `MOST_BYTES`, or whose headers promise more than it holds."""
     if not path.is_file():
         raise InputError(path, "this file must exist", "no such file", "Run the step that makes it first.")
     try:
@@ -205,8 +205,8 @@ def require_modest(path: Path, most: int = MOST_BYTES) -> None:
             sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
     except (DamagedFile, zipfile.BadZipFile, OSError) as error:
         raise InputError(path, "this file must be readable", str(error), "Delete it and run its step again.") from error
-    if sum(sizes.values()) > most:
-        rule = f"at most {most / 1e9:.1f} GB are opened"
+    if sum(sizes.values()) > MOST_BYTES:
+        rule = f"at most {MOST_BYTES / 1e9:.1f} GB are opened"
         raise InputError(path, rule, f"{sum(sizes.values()) / 1e9:.1f} GB", "Show a smaller run.")
     for name, shape in shapes.items():
         if name != META and math.prod(shape) > sizes[name]:

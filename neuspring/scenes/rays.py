@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import warp as wp
+
+
+def on_cpu(values: np.ndarray, kind: Any) -> Any:
+    """A Warp array in the memory of the CPU."""
+    return wp.array(values, dtype=kind, device="cpu")
 
 
 @wp.func

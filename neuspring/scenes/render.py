@@ -17,7 +17,7 @@ import warp as wp
 from scipy.sparse import coo_matrix
 
 from neuspring.data.camera import Camera
-from neuspring.scenes.rays import cast, shade_table
+from neuspring.scenes.rays import cast, on_cpu, shade_table
 
 LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
 """Direction to the light."""
@@ -69,14 +69,14 @@ class Renderer:
         grains = np.zeros((max(part.label for part in parts) + 1, 2))
         for part in parts:
             grains[part.label] = part.grain
-        self._rest: wp.array = wp.array(np.concatenate([part.rest for part in parts]), dtype=wp.vec3, device="cpu")
-        self._colors: wp.array = wp.array(np.concatenate([part.colors for part in parts]), dtype=wp.vec3, device="cpu")
-        self._indices: wp.array = wp.array(self._faces.ravel(), dtype=wp.int32, device="cpu")
-        self._labels: wp.array = wp.array(labels, dtype=wp.int32, device="cpu")
-        self._grains: wp.array = wp.array(grains, dtype=wp.vec2, device="cpu")
+        self._rest = on_cpu(np.concatenate([part.rest for part in parts]), wp.vec3)
+        self._colors = on_cpu(np.concatenate([part.colors for part in parts]), wp.vec3)
+        self._indices = on_cpu(self._faces.ravel(), wp.int32)
+        self._labels = on_cpu(labels, wp.int32)
+        self._grains = on_cpu(grains, wp.vec2)
         self._points = wp.zeros(int(counts[-1]), dtype=wp.vec3, device="cpu")
         self._normals = wp.zeros_like(self._points)
-        self._offsets: wp.array = wp.array(SUBPIXELS, dtype=wp.vec2, device="cpu")
+        self._offsets = on_cpu(SUBPIXELS, wp.vec2)
         self._mesh: wp.Mesh | None = None
         self._tables: dict[tuple[object, ...], wp.array] = {}
         corners = self._faces.T.ravel()

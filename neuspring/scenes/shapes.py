@@ -12,6 +12,8 @@ import numpy as np
 import warp as wp
 from warp.geometry import IsoSurfaceMarchingCubes
 
+from neuspring.scenes.rays import on_cpu
+
 Sdf = Callable[[np.ndarray], np.ndarray]
 
 
@@ -67,7 +69,7 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     first = np.asarray(low, float)
     counts = np.ceil((np.asarray(high, float) - first) / spacing).astype(int) + 1
     distances = sdf((first + spacing * grid(counts)).reshape(-1, 3)).reshape(counts)
-    values: wp.array = wp.array(distances, dtype=wp.float32, device="cpu")
+    values = on_cpu(distances, wp.float32)
     # The extractor rejects a grid's bounds in two forms: lattice coordinates are the plain one, scaled here.
     points, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
     vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)

@@ -7,7 +7,7 @@ law of the true stiffness. Observation adds noise and occlusion; the truth (a Tw
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -169,12 +169,12 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str) -> Twin:
         contact_friction=0.3,
         contact_distance=0.01,
     )
-    frame_time = 1.0 / TOY_FRAME_RATE
-    simulation = Simulation(frame_time=frame_time, substeps=1, up="+z", ground=row.ground, self_collision=row.self_collision)
+    simulation = Simulation(
+        frame_time=1.0 / TOY_FRAME_RATE, substeps=1, up="+z", ground=row.ground, self_collision=row.self_collision
+    )
     twin = Twin(topology=topology, material=material, simulation=simulation)
     # Half of what stability allows, so that the truth's own time-stepping error stays small.
-    substeps = stability.smallest_safe_substeps(stability.twin_spectrum(twin), frame_time, 0.25)
-    return replace(twin, simulation=replace(simulation, substeps=substeps))
+    return stability.with_substeps(twin, stability.needed_substeps(twin, 0.25))
 
 
 def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarray, settings: ToyObservation) -> Observations:

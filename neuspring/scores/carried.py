@@ -121,7 +121,8 @@ def points_in_image(
     marked [F or more, K, 2], px, NaN where a point is not marked. A point that frame 0 does not have is left out.
     """
     places = carried_in_image(intrinsics, camera_to_world, positions, marked[0], surface)
-    return _means(np.linalg.norm(places - marked[: len(places)], axis=2))
+    errors = np.linalg.norm(places - marked[: len(places)], axis=2)
+    return means(errors, np.isfinite(errors))
 
 
 def carried_in_image(
@@ -164,14 +165,13 @@ def points_on_table(
             touching = (up * carried[:, 2] < FLAT_HEIGHT) & np.isfinite(marked[: len(nodes), k]).all(axis=1)
             seen = _on_plane(camera, marked[: len(nodes), k][touching], carried[touching, 2])
             errors[touching, k] = np.linalg.norm(seen - carried[touching], axis=1)
-    return _means(errors)
+    return means(errors, np.isfinite(errors))
 
 
-def _means(errors: np.ndarray) -> np.ndarray:
-    """Mean per frame [F] of what is known of errors [F, K]; NaN where nothing is."""
-    known = np.isfinite(errors)
+def means(errors: np.ndarray, known: np.ndarray, none: float = np.nan) -> np.ndarray:
+    """Mean per frame [F] of the `known` errors, both [F, K]; `none` where there are none."""
     count, total = known.sum(axis=1), np.where(known, errors, 0.0).sum(axis=1)
-    mean: np.ndarray = np.divide(total, count, out=np.full(len(errors), np.nan), where=count > 0)
+    mean: np.ndarray = np.divide(total, count, out=np.full(len(errors), none), where=count > 0)
     return mean
 
 

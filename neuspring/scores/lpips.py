@@ -11,6 +11,7 @@ torch is imported where it is used, because the workflow asks for the weights be
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from neuspring.core.weights import find_file, hub_folder, read_tensors
 
 if TYPE_CHECKING:
     import torch
+    from torch.nn import Sequential
 
 BACKBONE = "alexnet-owt-7be5be79.pth"
 BACKBONE_DIGEST = "7be5be79"
@@ -48,16 +50,8 @@ def find_weights(backbone: Path | None = None, heads: Path | None = None, *, tru
     return "; ".join(reason for reason in (first, second) if isinstance(reason, str))
 
 
-CHANNELS = (3, 64, 192, 384, 256, 256)
-"""Channels of the picture and after each convolution."""
-WINDOWS = (11, 5, 3, 3, 3)
-"""px, of each convolution."""
-STRIDES = (4, 1, 1, 1, 1)
-PADDINGS = (2, 2, 1, 1, 1)
-LAYERS = (0, 3, 6, 8, 10)
-"""Indices of the convolutions in torchvision's `features`."""
-POOLED = (1, 2)
-"""Convolutions that follow a max-pooling of 3 px, stride 2."""
+HEAD_CHANNELS = (64, 192, 384, 256, 256)
+"""Channels after each convolution."""
 RGB_SHIFT = (-0.030, -0.088, -0.188)
 RGB_SCALE = (0.458, 0.448, 0.450)
 """ImageNet's means and deviations of R, G, B, for pictures in [-1, 1]."""
@@ -65,13 +59,37 @@ LEAST_NORM = 1e-10
 """Added to the length of a feature before dividing by it."""
 
 
+def alexnet() -> Sequential:
+    """AlexNet's convolutions, in torchvision's order."""
+    from torch.nn import Conv2d, MaxPool2d, ReLU, Sequential
+
+    return Sequential(
+        *(Conv2d(3, 64, 11, stride=4, padding=2), ReLU(), MaxPool2d(3, 2)),
+        *(Conv2d(64, 192, 5, padding=2), ReLU(), MaxPool2d(3, 2)),
+        *(Conv2d(192, 384, 3, padding=1), ReLU(), Conv2d(384, 256, 3, padding=1), ReLU()),
+        *(Conv2d(256, 256, 3, padding=1), ReLU()),
+    )
+
+
+def read_layers(path: Path, make: Callable[[], Sequential], device: str) -> Sequential:
+    """Layers, float32 and without gradients, with the weights of a file of torchvision. Raises InputError for a damaged file."""
+    import torch
+
+    # Layers without memory: the tensors of the file become their parameters.
+    with torch.device("meta"):
+        layers = make().requires_grad_(False)
+    shapes = {f"features.{name}": tuple(parameter.shape) for name, parameter in layers.named_parameters()}
+    tensors = read_tensors(path, shapes, device)
+    layers.load_state_dict(dict(zip(layers.state_dict(), tensors, strict=True)), assign=True)
+    return layers
+
+
 @dataclass(frozen=True, eq=False)
 class Lpips:
     """The distance with its weights, all float32 on one device."""
 
-    kernels: list[torch.Tensor]
-    """Kernel of each convolution [out, in, window, window]."""
-    biases: list[torch.Tensor]
+    layers: Sequential
+    """Convolutions, each with a ReLU."""
     heads: list[torch.Tensor]
     """w_l [1, channels, 1, 1]."""
 
@@ -82,14 +100,8 @@ class Lpips:
         if isinstance(weights, str):
             remedy = f"Get the backbone from {BACKBONE_ADDRESS}, the heads with `pip install --no-deps lpips`."
             raise InputError("LPIPS", "its weights must be in torch hub's cache", weights, remedy)
-        shapes = {
-            f"features.{layer}.weight": (after, before, window, window)
-            for layer, before, after, window in zip(LAYERS, CHANNELS[:-1], CHANNELS[1:], WINDOWS, strict=True)
-        }
-        biases = {f"features.{layer}.bias": (after,) for layer, after in zip(LAYERS, CHANNELS[1:], strict=True)}
-        tensors = read_tensors(weights[0], {**shapes, **biases}, device)
-        linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(CHANNELS[1:])}
-        return cls(tensors[: len(LAYERS)], tensors[len(LAYERS) :], read_tensors(weights[1], linear, device))
+        linear = {f"lin{k}.model.1.weight": (1, channels, 1, 1) for k, channels in enumerate(HEAD_CHANNELS)}
+        return cls(read_layers(weights[0], alexnet, device), read_tensors(weights[1], linear, device))
 
     @classmethod
     def cached(cls, device: str) -> Lpips | str:
@@ -100,15 +112,14 @@ class Lpips:
 
     def features(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """The output of each ReLU [B, channels, h, w] for normalized pictures [B, 3, H, W]."""
-        from torch.nn.functional import conv2d, max_pool2d, relu
+        from torch.nn import ReLU
 
-        layers = []
-        for k, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
-            if k in POOLED:
-                pictures = max_pool2d(pictures, 3, 2)
-            pictures = relu(conv2d(pictures, kernel, bias, STRIDES[k], PADDINGS[k]))
-            layers.append(pictures)
-        return layers
+        found = []
+        for layer in self.layers:
+            pictures = layer(pictures)
+            if isinstance(layer, ReLU):
+                found.append(pictures)
+        return found
 
     def __call__(self, a: torch.Tensor, b: torch.Tensor, *, released_range: bool = False) -> torch.Tensor:
         """Distances [...] of pictures [..., 3, H, W] in [0, 1], at least 31 px wide and high; 0 for equal ones. Differentiable.

@@ -24,7 +24,7 @@ import numpy as np
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.errors import InputError
 from neuspring.registry import Registry
-from neuspring.scores.carried import CARRIERS, bound_positions, points_in_image, points_on_table
+from neuspring.scores.carried import CARRIERS, bound_positions, means, points_in_image, points_on_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -167,11 +167,7 @@ def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[n
     if not matched.any():
         return np.full(len(positions), np.nan)
     error = np.linalg.norm(carried(tracks[0][matched]) - tracks[:, matched], axis=2)
-    valid = annotated[:, matched]
-    count = valid.sum(axis=1)
-    total = np.where(valid, error, 0.0).sum(axis=1)
-    mean: np.ndarray = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-    return mean
+    return means(error, annotated[:, matched], 0.0)
 
 
 def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bool) -> np.ndarray | None:
@@ -294,9 +290,14 @@ def score(
             usable = values[frames.start : frames.stop]
             usable = usable[~np.isnan(usable)]
             if len(usable):
-                identity = (scenario.name, scenario.category, method, seed, task, metric)
-                rows.append((*identity, float(usable.mean()), METRICS[metric].unit, len(usable)))
+                rows.append(_score_row(scenario, method, seed, task, metric, usable))
     return _table(rows)
+
+
+def _score_row(scenario: Scenario, method: str, seed: int, task: str, metric: str, values: Any) -> tuple[object, ...]:
+    """`SCORE_COLUMNS` of the values of a metric in the frames of a task."""
+    measured = float(values.mean()), METRICS[metric].unit, len(values)
+    return scenario.name, scenario.category, method, seed, task, metric, *measured
 
 
 def score_run(
@@ -334,19 +335,19 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
         part = frames[frames["frame"].isin(span)]
         for metric, values in part.groupby("metric", sort=False):
             per_frame = values.groupby("frame")["value"].mean()
-            identity = (scenario.name, scenario.category, method, seed, task, metric)
-            rows.append((*identity, float(per_frame.mean()), METRICS[str(metric)].unit, len(per_frame)))
+            rows.append(_score_row(scenario, method, seed, task, str(metric), per_frame))
     return _table(rows)
 
 
-def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metric")) -> pd.DataFrame:
-    """Both averages over scenarios: `equal` weighs scenarios equally, `frames` weighs them by their frames.
+def averages(scores: pd.DataFrame) -> pd.DataFrame:
+    """Both averages over scenarios of every method, task and metric.
 
-    The paper uses the first for distances and the second for pictures: that is `mean`, where metrics are told apart. Seeds are
+    `equal` weighs scenarios equally, `frames` weighs them by their frames.
+    The paper uses the first for distances and the second for pictures: that is `mean`. Seeds are
     averaged within each scenario first. `seed_std` is the standard deviation over seeds of the equal average, of the seeds
     that have every scenario: 0 for one seed, NaN where there are several seeds and fewer than two of them have every scenario.
     """
-    keys = list(by)
+    keys = ["method", "task", "metric"]
     groups = scores.groupby([*keys, "scenario"], sort=False)
     per_scenario = groups.agg(value=("value", "mean"), frames=("frames", "mean")).reset_index()
     per_scenario["weighted"] = per_scenario["value"] * per_scenario["frames"]
@@ -356,12 +357,10 @@ def averages(scores: pd.DataFrame, by: Iterable[str] = ("method", "task", "metri
     )
     result["frames"] = result.pop("weighted") / result.pop("all_frames")
     per_seed = scores.groupby([*keys, "seed"], sort=False).agg(value=("value", "mean"), scenarios=("scenario", "nunique"))
-    by_seed = per_seed.groupby(level=list(range(len(keys))))
+    by_seed = per_seed.groupby(level=keys)
     complete = per_seed[per_seed["scenarios"] == by_seed["scenarios"].transform("max")]
-    spread = complete["value"].groupby(level=list(range(len(keys)))).std(ddof=1)
+    spread = complete["value"].groupby(level=keys).std(ddof=1)
     result["seed_std"] = spread.reindex(result.index).where(by_seed.size().reindex(result.index) > 1, 0.0)
     result = result.reset_index()
-    if "metric" not in keys:
-        return result
     framed = result["metric"].map(lambda name: METRICS[name].average == "frames")
     return result.assign(mean=np.where(framed, result["frames"], result["equal"]))

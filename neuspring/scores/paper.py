@@ -73,15 +73,15 @@ def tables() -> tuple[str, ...]:
     return tuple(dict.fromkeys(row["table"] for row in _rows("paper_tables.csv")))
 
 
-def released_scores(rows: Iterable[Mapping[str, str]] | None = None) -> Values:
-    """Scores of the released PhysTwin in stored units, by scenario, task, metric; of other `rows` than those that ship.
+def released_scores() -> Values:
+    """Scores of the released PhysTwin in stored units, by scenario, task, metric.
 
     Means over scenarios stand under names that begin with `MEANS`.
     """
     names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
     return {
         (row["scenario"], names.get(row["split"], row["split"]), names.get(row["metric"], row["metric"])): printed(row["value"])
-        for row in (_rows("released_phystwin_scores.csv") if rows is None else rows)
+        for row in _rows("released_phystwin_scores.csv")
     }
 
 

@@ -202,8 +202,13 @@ def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
     return _with_run(stacked(tables))
 
 
+def _named(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows with the names of their runs."""
+    return rows.assign(run=rows["scenario"] + "/" + rows["method"] + "/" + rows["seed"].astype(str))
+
+
 def _with_run(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.assign(run=rows["scenario"] + "/" + rows["method"] + "/" + rows["seed"].astype(str))[list(TABLE_COLUMNS)]
+    return _named(rows)[list(TABLE_COLUMNS)]
 
 
 def _filled(runs: pd.DataFrame) -> pd.DataFrame:
@@ -284,10 +289,9 @@ def read_scores(path: Path) -> ScoreTable:
         raise InputError(path, rule, one_line(error), remedy) from error
     beside = path.with_name("runs.csv")
     if beside.is_file():
-        runs = pd.read_csv(beside)
-        runs = runs.assign(run=runs["scenario"] + "/" + runs["method"] + "/" + runs["seed"].astype(str))
-        return ScoreTable(rows, _filled(runs.reindex(columns=list(RUN_COLUMNS))))
-    runs = rows[["run", *RUN_KEYS]].drop_duplicates(ignore_index=True).assign(status="ok", source=path.name)
+        runs = _named(pd.read_csv(beside))
+    else:
+        runs = rows[["run", *RUN_KEYS]].drop_duplicates(ignore_index=True).assign(status="ok", source=path.name)
     return ScoreTable(rows, _filled(runs.reindex(columns=list(RUN_COLUMNS))))
 
 

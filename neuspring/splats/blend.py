@@ -39,10 +39,10 @@ class Tiles:
 
 
 @torch.no_grad()
-def tiles(depths: torch.Tensor, boxes: torch.Tensor, view: View, side: int | None = None) -> Tiles:
+def tiles(depths: torch.Tensor, boxes: torch.Tensor, view: View) -> Tiles:
     """Lists for ellipses with depths [M] and boxes [M, 4], all of which touch the picture. Equal depths keep their order."""
     device = depths.device
-    side = side or TILE_SIDE[device.type]
+    side = TILE_SIDE[device.type]
     across, down = -(-view.width // side), -(-view.height // side)
     order = torch.sort(depths, stable=True).indices
     low = torch.div(boxes[order, :2], side, rounding_mode="floor")

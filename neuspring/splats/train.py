@@ -155,17 +155,12 @@ class SplatRates(Appearance):
     scale_rate: float = 5e-3
     """Learning rate of log scales."""
 
-    @classmethod
-    def of(cls, settings: Appearance) -> SplatRates:
-        """The training that the settings ask for."""
-        return cls(**vars(settings))
-
 
 class _Optimizer:
     """Adam over the tensors of `Gaussians`, whose number may change."""
 
     def __init__(self, gaussians: Gaussians, settings: Appearance, extent: float) -> None:
-        settings = SplatRates.of(settings)
+        settings = SplatRates(**vars(settings))
         self.settings, self.extent = settings, extent
         values = _parameters(vars(gaussians))
         rates = {

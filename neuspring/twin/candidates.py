@@ -150,13 +150,13 @@ def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_66
     """
     if frame_time_667 or settings.substeps != "auto":
         count = stability.RELEASED_SUBSTEPS if frame_time_667 else int(settings.substeps)
-        twin = replace(twin, simulation=replace(twin.simulation, substeps=count))
+        twin = stability.with_substeps(twin, count)
         stability.check(twin)
         return twin
-    count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), twin.simulation.frame_time, settings.safety)
+    count = stability.needed_substeps(twin, settings.safety)
     if count > stability.MAX_SUBSTEPS:
         raise NumericalFailure(f"needs {count} substeps per frame, more than {stability.MAX_SUBSTEPS}")
-    return replace(twin, simulation=replace(twin.simulation, substeps=count))
+    return stability.with_substeps(twin, count)
 
 
 def candidate(problem: SearchProblem, values: dict[str, float], push: bool = False) -> Twin:

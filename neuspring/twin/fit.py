@@ -18,7 +18,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -200,9 +200,8 @@ class FitRecording:
 
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
-        twin = self.twin
-        if count != twin.simulation.substeps:
-            self.source.replace(replace(twin, simulation=replace(twin.simulation, substeps=count)))
+        if count != self.twin.simulation.substeps:
+            self.source.replace(stability.with_substeps(self.twin, count))
 
     def stable(self, parameters: TwinParameters) -> Parameters:
         """The present parameters, packed, after checking that they can be integrated.

@@ -131,11 +131,6 @@ class LossSums:
                 self._other_terms[twin] += sum(term.double() for term in terms)
         b.launch(check_divergence, b.groups, x, slot, b.nodes, float(frame), views["diverged"])
 
-    def costs(self, frames: int) -> list[float]:
-        """Mean loss of `frames` frames, of each twin."""
-        totals = self._buffers.of_twins(self._total.reshape(-1)) + self._other_terms
-        return [float(total) / frames for total in totals.cpu()]
-
     @property
     def diverged(self) -> torch.Tensor:
         """The frame in which each twin left the scene; 0 if it did not."""
@@ -148,12 +143,9 @@ class LossSums:
 
     def result(self, frames: int) -> list[Outcome]:
         """The outcome of each twin after so many frames."""
-        return [
-            Outcome(math.inf if frame else cost, int(frame), overflow)
-            for cost, frame, overflow in zip(
-                self.costs(frames), self.diverged.tolist(), self._solver.overflows[self._twins], strict=True
-            )
-        ]
+        totals = self._buffers.of_twins(self._total.reshape(-1)) + self._other_terms
+        ends = zip(totals.tolist(), self.diverged.tolist(), self._solver.overflows[self._twins], strict=True)
+        return [Outcome(math.inf if frame else total / frames, int(frame), overflow) for total, frame, overflow in ends]
 
 
 @functools.cache

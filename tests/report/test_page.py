@@ -12,7 +12,7 @@ import pytest
 from neuspring import config
 from neuspring.core.errors import InputError
 from neuspring.core.text import program
-from neuspring.report.blocks import PageSection, Text
+from neuspring.report.blocks import Text
 from neuspring.report.data import ReportSection
 from neuspring.report.page import REPORT_SECTIONS, Options, write
 from neuspring.report.sections.strip import around
@@ -151,11 +151,11 @@ def test_a_click_sorts_a_table_words_filter_it_and_a_link_unfolds_its_section(tm
 
 def test_a_package_adds_a_section_that_stands_where_it_says(monkeypatch, small):
     def hello(material):
-        return PageSection(key="hello", title="Hello", blocks=[Text(text=f"{len(material.runs)} runs")])
+        return [Text(text=f"{len(material.runs)} runs")]
 
     point = EntryPoint("hello", "package:section", "neuspring.report_sections")
     monkeypatch.setitem(vars(REPORT_SECTIONS), "_foreign", {"hello": point})
-    monkeypatch.setattr(EntryPoint, "load", lambda _: ReportSection(order=15, make=hello))
+    monkeypatch.setattr(EntryPoint, "load", lambda _: ReportSection(order=15, title="Hello", make=hello))
     monkeypatch.setitem(vars(REPORT_SECTIONS), "_loaded", {})
     made = report(small)
     assert re.findall(r"<h2>(.*?)</h2>", made)[:3] == ["Verdict", "Hello", "Scores"]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from neuspring.extensions.color_alone.pixels import disc
 from neuspring.perception.segment_opencv import bins_of as opencv_bins
 
 LAB_BINS = (32, 64, 64)
@@ -159,5 +160,4 @@ def shaded_density(step: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 def apart(labels: np.ndarray, distance: int) -> np.ndarray:
     """Pixels of a mask [H, W] without a label within `distance` pixels."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1,) * 2)
-    return np.asarray(cv2.dilate((labels > 0).astype(np.uint8), kernel) == 0)
+    return np.asarray(cv2.dilate((labels > 0).astype(np.uint8), disc(distance)) == 0)

@@ -33,6 +33,7 @@ from scipy import ndimage
 from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
+from neuspring.extensions.color_alone.pixels import disc, pixels_of
 from neuspring.perception.shape import discs
 
 SILHOUETTES = {"cloth": "flat", "rope": "round"}
@@ -80,8 +81,7 @@ class FirstFrame:
         kind = SILHOUETTES.get(category, "body")
         if not (labels == OBJECT).any():
             raise InputError(f"{capture.folder}, masks of frame 0", "the object must be in view", "none of its pixels")
-        y, x = np.nonzero(labels == OBJECT)
-        below = camera_depth(camera, np.stack([x, y], axis=1), 0.0)
+        below = camera_depth(camera, pixels_of(labels == OBJECT), 0.0)
         if not (np.isfinite(below) & (below > 0)).all():
             rule = "every pixel of the object in frame 0 must look at the table, z = 0"
             remedy = "Check camera_to_world and up: without depth the table is where they say."
@@ -98,11 +98,10 @@ class FirstFrame:
         else:
             bounds = {None: FOOTPRINT, "lying": np.inf, "standing": STANDING_FOOTPRINT}
             depth, thick, facts = medial(camera, up, filled, BODY_THICKNESS, bounds[capture.description.pose])
-        y, x = np.nonzero(filled)
-        pixels, heights, lower = np.stack([x, y], axis=1).astype(float), np.zeros(filled.shape), np.zeros(filled.shape)
+        pixels, heights, lower = pixels_of(filled).astype(float), np.zeros(filled.shape), np.zeros(filled.shape)
         for side, found in zip((heights, lower), inflated(filled, depth, thick), strict=True):
             # The table cuts off what would be below it.
-            side[y, x] = np.maximum(up * camera.lift(pixels, found[y, x])[:, 2], 0.0)
+            side[filled] = np.maximum(up * camera.lift(pixels, found[filled])[:, 2], 0.0)
         return cls(camera, up, kind, filled, heights, lower, size, facts)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
@@ -136,9 +135,8 @@ class FirstFrame:
 
     def depths(self, share: float) -> np.ndarray:
         """Depth [H, W], m, of the upper side (share 1) or of the lower one (0); 0 outside."""
-        y, x = np.nonzero(self.filled)
-        depth = np.zeros(self.filled.shape)
-        depth[y, x] = camera_depth(self.camera, np.stack([x, y], axis=1), self.up * self._between(share)[y, x])
+        filled, depth = self.filled, np.zeros(self.filled.shape)
+        depth[filled] = camera_depth(self.camera, pixels_of(filled), self.up * self._between(share)[filled])
         return depth
 
 
@@ -184,9 +182,8 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
     A hand's pixel lies between them if it is in the object's closing by a disc of radius `reach`, pixels.
     """
     radius = max(round(reach), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
     padded = np.pad((labels == OBJECT).astype(np.uint8), radius)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius] > 0
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc(radius))[radius:-radius, radius:-radius] > 0
     return np.asarray((labels == OBJECT) | (closed & (labels >= HANDS)))
 
 

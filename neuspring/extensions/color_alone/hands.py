@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.core.artifacts import ImageObservations
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.frames import frames_of, gray, spread
+from neuspring.extensions.color_alone.pixels import away_from, disc, pixels_of
 from neuspring.perception.figures import STRIP_FRAMES
 
 CORNERS, LEAST_CORNERS, CORNERS_KEPT = 120, 6, 0.5
@@ -68,18 +69,13 @@ def grips(labels: np.ndarray, filled: np.ndarray, reach: float, apart: float, le
     lie `apart` or more from each other (pixels) are different hands. Of each, those within `length` of its tip hold, the pixel that
     lies farthest along the arm; all, where no arm enters the image.
     """
-    away = cv2.distanceTransform((labels != OBJECT).astype(np.uint8) * (~filled).astype(np.uint8), cv2.DIST_L2, 5)
+    away = away_from((labels == OBJECT) | filled)
     hands = labels == HANDS
     if not hands.any():
         return []
     near = hands & (away <= max(reach, float(away[hands].min()) + 2.0))
-    radius = max(round(apart / 2), 1)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
-    count, pieces = cv2.connectedComponents(cv2.dilate(near.astype(np.uint8), disc))
-    found = []
-    for piece in range(1, count):
-        y, x = np.nonzero(near & (pieces == piece))
-        found.append(np.stack([x, y], axis=1))
+    count, pieces = cv2.connectedComponents(cv2.dilate(near.astype(np.uint8), disc(max(round(apart / 2), 1))))
+    found = [pixels_of(near & (pieces == piece)) for piece in range(1, count)]
     largest = max(len(one) for one in found)
     # Specks of a mask are no hands.
     found = [one for one in found if len(one) >= 0.1 * largest]
@@ -171,9 +167,9 @@ def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: 
     """Corners (x, y) [n, 2] of hands around a place, within their mask; of a wider place if there are few."""
     inside = cv2.erode((labels == HANDS).astype(np.uint8), np.ones((2 * CORNER_EDGE + 1,) * 2, np.uint8))
     for factor in (1.0, 1.6, 2.5):
-        disc = np.zeros_like(inside)
-        cv2.circle(disc, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
-        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & disc, blockSize=3)  # type: ignore[operator]
+        around = np.zeros_like(inside)
+        cv2.circle(around, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
+        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & around, blockSize=3)  # type: ignore[operator]
         if found is not None and len(found) >= 3 * LEAST_CORNERS:
             return np.asarray(found.reshape(-1, 2))
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))

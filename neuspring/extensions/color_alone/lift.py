@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 
 from neuspring.config.perception import Perception
@@ -21,6 +20,7 @@ from neuspring.extensions.color_alone.checks import findings_of
 from neuspring.extensions.color_alone.first_frame import FirstFrame
 from neuspring.extensions.color_alone.given import GivenFrame
 from neuspring.extensions.color_alone.hands import follow_hands, grips, hands_strip, place
+from neuspring.extensions.color_alone.pixels import away_from, pixels_of
 from neuspring.intake.points import InSpace, held, read
 from neuspring.perception.backends import Lifted
 from neuspring.perception.controllers import ALWAYS, MOST_CONTROLLERS
@@ -112,8 +112,7 @@ def lift_color(
     own = labels[0][start[:, 1], start[:, 0]] == OBJECT
     if not own.any():
         raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
-    y, x = np.nonzero(first.filled & (labels[0] != OBJECT))
-    hidden = np.stack([x, y], axis=1)[::HIDDEN_STRIDE].astype(np.float32)
+    hidden = pixels_of(first.filled & (labels[0] != OBJECT))[::HIDDEN_STRIDE].astype(np.float32)
     pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
     visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
     # Nothing of the object is handed on from future frames, or of repeated images.
@@ -143,8 +142,6 @@ def lift_color(
         hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]))
     else:
         hands = held(space.hands, space.tracks, capture.train_end)
-    y, x = np.nonzero(first.filled)
-    cloud_pixels = np.stack([x, y], axis=1)
     colors = capture.color(name, 0) / 255.0
     place_rows, pose = np.round(places).astype(int), capture.description.pose
     facts |= {
@@ -163,8 +160,8 @@ def lift_color(
         object_colors=colors[place_rows[:, 1], place_rows[:, 0]],
         controller_points=hands,
         controller_valid=ALWAYS if space.hands is None else space.hands.holds,
-        cloud=first.points(cloud_pixels),
-        cloud_colors=colors[y, x],
+        cloud=first.points(pixels_of(first.filled)),
+        cloud_colors=colors[first.filled],
         backend=", ".join(["color alone", first.kind, *([pose] if pose and first.kind == "body" else [])]),
         facts=facts,
     )
@@ -208,14 +205,12 @@ def silhouettes(labels: np.ndarray, samples: int = OUTLINE_POINTS) -> dict[str, 
         if not (label == OBJECT).any():
             # Out of view: nothing says where it is.
             continue
-        away = cv2.distanceTransform((label == NOTHING).astype(np.uint8), cv2.DIST_L2, 5)
-        padded = np.pad(away, ((0, -height % cell), (0, -width % cell)), mode="edge")
+        padded = np.pad(away_from(label != NOTHING), ((0, -height % cell), (0, -width % cell)), mode="edge")
         outside[frame] = padded.reshape(outside.shape[1], cell, outside.shape[2], cell).mean(axis=(1, 3))
-        from_object = cv2.distanceTransform((label != OBJECT).astype(np.uint8), cv2.DIST_L2, 5)
-        y, x = np.nonzero(label == OBJECT)
-        rows = rng.choice(len(x), min(count, len(x)), replace=False)
-        inside[frame, : len(rows)] = np.stack([x[rows], y[rows]], axis=1)
+        shown = pixels_of(label == OBJECT)
+        rows = rng.choice(len(shown), min(count, len(shown)), replace=False)
+        inside[frame, : len(rows)] = shown[rows]
         # As many points were once drawn beside the object too; without that draw the samples of later frames would be others.
-        near = int(((label == NOTHING) & (from_object <= HAND_BAND)).sum())
+        near = int(((label == NOTHING) & (away_from(label == OBJECT) <= HAND_BAND)).sum())
         rng.choice(near, min(count, near), replace=False)
     return {"inside": inside, "outside": outside}

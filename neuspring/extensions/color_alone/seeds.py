@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from neuspring.data.capture import HANDS, NOTHING, OBJECT, PERSON
+from neuspring.extensions.color_alone.pixels import away_from
 from neuspring.perception.marks import FILLED_MARKS, Mark, drawn
 
 UNMARKED_PIXEL = 255
@@ -52,13 +52,12 @@ class Seeds:
                 possible[label] = np.any([*areas, *lines], axis=0)
             elif not carried:
                 # Not bounded: what is far from all marks of a label needs a color that says so.
-                far = cv2.distanceTransform((~np.any([*areas, *lines], axis=0)).astype(np.uint8), cv2.DIST_L2, 5)
+                far = away_from(np.any([*areas, *lines], axis=0))
                 prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
             for mark in own:
                 if mark.kind == "polygon":
                     inside = drawn(mark, size, scale, grown=0)
-                    away = [cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 5) for part in (inside, ~inside)]
-                    slope = (away[0] - away[1]) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
+                    slope = (away_from(~inside) - away_from(inside)) / max(POLYGON_SLOPE * mark.radius * scale, 0.5)
                     prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
         for shapes in (("polygon", "box"), ("scribble", "click")):
             for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, PERSON, NOTHING).index(mark.value)):

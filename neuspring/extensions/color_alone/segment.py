@@ -26,6 +26,7 @@ from neuspring.extensions.color_alone.colors import (
     count,
     mixed,
 )
+from neuspring.extensions.color_alone.pixels import core_of
 from neuspring.extensions.color_alone.seeds import Seeds
 from neuspring.extensions.color_alone.solve import MarkedFrame, Pass, start
 from neuspring.perception.film import CameraFilm, Carried, Film, Progress, doubt_of, over_capture
@@ -50,7 +51,7 @@ def cues_of(probability: np.ndarray, other: np.ndarray) -> float:
     labels = probability.argmax(axis=0)
     apart = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
     shown = np.isin(labels, (OBJECT, HANDS))
-    rim = shown & (cv2.erode(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    rim = shown & ~core_of(shown)
     unsure = float(2 * (1 - probability.max(axis=0)[rim]).mean()) if rim.any() else 0.0
     return float((apart / DISAGREEMENT) ** 2 + (unsure / UNSURE_BORDER) ** 2)
 

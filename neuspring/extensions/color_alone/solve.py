@@ -22,6 +22,7 @@ from neuspring.extensions.color_alone.colors import (
     mixed,
     shaded_density,
 )
+from neuspring.extensions.color_alone.pixels import away_from, core_of, disc
 from neuspring.extensions.color_alone.seeds import ODDS_FALL, UNMARKED_PIXEL, Seeds
 from neuspring.perception.film import at_border
 
@@ -129,7 +130,7 @@ def _open(logs: np.ndarray) -> np.ndarray:
     best = logs.argmax(axis=0).astype(np.uint8)
     kernel = np.ones((3, 3), np.uint8)
     border = (cv2.dilate(best, kernel) != cv2.erode(best, kernel)).astype(np.uint8)
-    near = cv2.dilate(border, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER_REACH + 1,) * 2)).astype(bool)
+    near = cv2.dilate(border, disc(BORDER_REACH)).astype(bool)
     first = logs.max(axis=0)
     others = np.stack([np.where(best == label, -np.inf, part) for label, part in enumerate(logs)]).max(axis=0)
     return np.asarray(near & (first - others < DECIDED))
@@ -196,11 +197,9 @@ def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, seeds: Seed
     counts = []
     for label in range(len(seeds.possible)):
         own = labels == label
-        core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-        # A thin rope has no core.
-        parts = [(1.0, count(bins, core if core.sum() > 0.5 * own.sum() else own))]
+        parts = [(1.0, count(bins, core_of(own, 0.5)))]
         if label == NOTHING:
-            near = own & (cv2.distanceTransform(own.astype(np.uint8), cv2.DIST_L2, 5) < 0.1 * max(own.shape))
+            near = own & (away_from(~own) < 0.1 * max(own.shape))
             parts.append((1.0, count(bins, near)))
             for shade in BACKGROUND_SHADES:
                 darker = lab.copy()
@@ -307,8 +306,7 @@ class Pass:
         if part is not None:
             self._show(near, part)
             for label in self._new(part):
-                away = cv2.distanceTransform((part.certain != label).astype(np.uint8), cv2.DIST_L2, 5)
-                place[label] += np.exp(-away / (ODDS_FALL * max(self.lab.shape)))
+                place[label] += np.exp(-away_from(part.certain == label) / (ODDS_FALL * max(self.lab.shape)))
             place = place / place.sum(axis=0)
         color = self.color_logs(near, before, window, None if depth is None else depth[window])
         logs = np.log(place) + color
@@ -441,9 +439,7 @@ class Pass:
         for label in range(len(self.first)):
             sure = self.probability[label] > CONFIDENT
             if label != NOTHING:
-                core = cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-                # A thin rope has no core.
-                sure = (core if core.sum() > 0.4 * sure.sum() else sure) & ~self.explained
+                sure = core_of(sure, 0.4) & ~self.explained
             seen = count(bins, sure)
             if seen.sum():
                 self.running[label] = (1 - LEARN) * self.running[label] + LEARN * seen / seen.sum()
@@ -457,8 +453,7 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
     carried = place.argmax(axis=0)
     for label in range(len(logs)):
         if (wrong := (seeds.certain == label) & (carried != label)).any():
-            away = cv2.distanceTransform((~wrong).astype(np.uint8), cv2.DIST_L2, 5)
-            logs[label] += CORRECTION * np.exp(-away / (CORRECTED * reach))
+            logs[label] += CORRECTION * np.exp(-away_from(wrong) / (CORRECTED * reach))
     return logs
 
 

@@ -39,9 +39,7 @@ class Chosen:
 
 def strip(picture: StripOptions) -> None:
     """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
-    require_ending(picture.output, PICTURE_ENDINGS)
-    require_between("--width", picture.width, 1.5, 20)
-    require_between("--dpi", picture.dpi, 50, 1200)
+    _require_paper(picture)
     chosen = _choose(picture)
     scenario = chosen.found.observations.scenario
     frames = sorted(set(_frames(picture.frames, scenario.frame_count) or chosen_frames(scenario, scenario.frame_count)))
@@ -68,9 +66,7 @@ def film(picture: FilmOptions) -> None:
 
 def twin(picture: TwinOptions) -> None:
     """Stiffness and regions of twins, from any side -> PDF or PNG."""
-    require_ending(picture.output, PICTURE_ENDINGS)
-    require_between("--width", picture.width, 1.5, 20)
-    require_between("--dpi", picture.dpi, 50, 1200)
+    _require_paper(picture)
     chosen = _choose(picture, positions=picture.frame > 0)
     _frames([picture.frame], chosen.found.observations.scenario.frame_count, "--frame")
     for take, run in zip(chosen.takes, chosen.runs, strict=True):
@@ -94,6 +90,13 @@ def twin(picture: TwinOptions) -> None:
         f"Wrote {picture.output}: {', '.join(take.label for take in chosen.takes)}, frame {picture.frame}, "
         f"camera {scene.camera.name}"
     )
+
+
+def _require_paper(picture: StripOptions | TwinOptions) -> None:
+    """Raise InputError for a file or a size that no picture on paper has."""
+    require_ending(picture.output, PICTURE_ENDINGS)
+    require_between("--width", picture.width, 1.5, 20)
+    require_between("--dpi", picture.dpi, 50, 1200)
 
 
 def require_ending(path: Path, endings: Sequence[str]) -> None:

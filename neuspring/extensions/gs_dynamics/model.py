@@ -84,11 +84,6 @@ class GsDynamicsTraining(GsDynamics):
     learning_rate: float = 1e-3
     """Adam's learning rate."""
 
-    @classmethod
-    def of(cls, settings: GsDynamics) -> GsDynamicsTraining:
-        """The training that the settings ask for."""
-        return cls(**vars(settings))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:

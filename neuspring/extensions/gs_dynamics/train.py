@@ -273,7 +273,7 @@ class GsDynamicsTrainer:
     """Runs epochs on the training frames of a capture."""
 
     def __init__(self, request: TrainingRequest) -> None:
-        self.settings, self.seed = GsDynamicsTraining.of(request.settings.baselines.gs_dynamics), request.seed
+        self.settings, self.seed = GsDynamicsTraining(**vars(request.settings.baselines.gs_dynamics)), request.seed
         self.category = request.observations.scenario.category
         self.rules, self.recipe = resolve(self.settings, self.category)
         self.tracks = Tracks.of(request.observations, self.settings)

@@ -160,9 +160,7 @@ class SplatLayer:
         centers: SplatCenters | None = None,
         seen: np.ndarray | None = None,
     ) -> None:
-        chosen = np.arange(len(splats.means))
-        if len(chosen) > MOST_DRAWN_SPLATS:
-            chosen = np.sort(np.random.default_rng(0).choice(chosen, MOST_DRAWN_SPLATS, replace=False))
+        chosen = sample(len(splats.means), MOST_DRAWN_SPLATS)
         self._nodes, self._centers, self._chosen = np.array(nodes, np.float32), centers, chosen
         self._means, self._turns = torch.tensor(splats.means[chosen]), torch.tensor(splats.quaternions[chosen])
         scales = np.exp(splats.log_scales[chosen].astype(float)) / SPLAT_UNIT

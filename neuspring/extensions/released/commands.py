@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from neuspring.cli.data import check_data
 from neuspring.cli.options import Positional, arg
 
 
@@ -22,14 +23,9 @@ def fetch(
 ) -> int:
     """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.extensions.released import fetch
-    from neuspring.intake.check import check_layout, render
 
     fetch.fetch(data_root, scenarios, parts, revision, dry_run=dry_run)
-    if dry_run or "data" not in parts:
-        return 0
-    findings = check_layout(data_root)
-    print(render(findings))
-    return 2 if any(finding.level == "error" for finding in findings) else 0
+    return 0 if dry_run or "data" not in parts else check_data(data_root)
 
 
 def verify_released(

@@ -6,6 +6,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.extensions.rods.nodes import bind
+from neuspring.extensions.rods.rod import arc_of, pieces
 
 LEAST_SLENDERNESS = 8.0
 """Length over radius below which a body is no rod: bending would shear it as much."""
@@ -44,7 +45,7 @@ def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> n
         # What lies far beside the line, as points of a hand, hardly pulls it.
         typical = max(float(np.median(apart)), 1e-9)
         weights = 1 / (1 + (apart / (0.67 * BESIDE_LINE * typical)) ** 8)
-        length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+        length = float(pieces(line).sum())
         slenderness = min(length / max(float(np.quantile(apart, 0.9)), 1e-9), 1e3)
     beside = float((apart > BESIDE_LINE * typical + 1e-3 * length).mean())
     if slenderness < LEAST_SLENDERNESS or beside > MOST_BESIDE:
@@ -102,14 +103,14 @@ def _projected(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.nda
     before, after = (line[[k]] + np.arange(1, reach + 1)[:, None] * (end - line[k]) for k, end in ((0, ends[0]), (-1, ends[1])))
     longer = np.concatenate([before[::-1], line, after])
     edge, place = bind(longer, np.zeros((len(longer) - 1, 3)), points)
-    lengths = np.linalg.norm(np.diff(longer, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])[edge] + np.clip(place[:, 0], 0, 1) * lengths[edge]
+    lengths = pieces(longer)
+    arc = arc_of(lengths)[edge] + np.clip(place[:, 0], 0, 1) * lengths[edge]
     foot = longer[edge] + np.clip(place[:, :1], 0, 1) * np.diff(longer, axis=0)[edge]
     return arc - lengths[:reach].sum(), np.linalg.norm(points - foot, axis=1)
 
 
 def _equally_spaced(line: np.ndarray, arc: np.ndarray, count: int) -> np.ndarray:
     """Points [count, 3] at equal arcs of a polyline, from the least to the largest arc of the nodes [N]."""
-    own = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    own = arc_of(pieces(line))
     at = np.linspace(max(arc.min(), 0.0), min(arc.max(), own[-1]), count)
     return np.stack([np.interp(at, own, column) for column in line.T], axis=1)

@@ -17,6 +17,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refusal, refused
 from neuspring.core.text import listed
 from neuspring.data.unpickle import load_pickle
+from neuspring.extensions.rods.rod import pieces
 from neuspring.extensions.rods.settings import Mocap
 from neuspring.intake.check import Layout
 
@@ -153,7 +154,7 @@ def length(cable: Cable) -> dict[str, Any]:
 
 def too_near(cable: Cable) -> dict[str, Any] | None:
     """The first marker of frame 0 that lies on its neighbor."""
-    short = np.flatnonzero(np.linalg.norm(np.diff(cable.points[0], axis=0), axis=1) < MIN_DISTANCE)
+    short = np.flatnonzero(pieces(cable.points[0]) < MIN_DISTANCE)
     return {"value": int(short[0]), "next": int(short[0]) + 1} if len(short) else None
 
 

@@ -83,10 +83,23 @@ class ClipNumbers(OwnStudy):
         return cls(name=name, study=study, results=results, sources=sources, methods=methods, seeds=seeds)
 
     def blocks(self) -> list[Any]:
-        return list(clip_blocks(self))
+        """L1 per cable beside published numbers; ours in detail. Then the rows and runs that are not there, and why."""
+        lines = [f"{label}: not run" for label in self.study.rows if label not in set(self.clips["label"])]
+        failed = self.records[self.records["status"] != "ok"].itertuples()
+        lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
+        last: list[Block] = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+        return [_overview(self), *([_details(self)] if len(self.clips) else []), *last]
 
     def files(self, folder: Path) -> list[str]:
-        return clip_files(self, folder)
+        """Write the CSV files and the figure; Markdown lines that show them."""
+        for suffix, rows in {"": self.cells, "_clips": self.clips}.items():
+            write_text(folder / f"{self.name}{suffix}.csv", rows.to_csv(index=False))
+        path = folder / f"{self.name}_growth.png"
+        path.unlink(missing_ok=True)
+        if not len(self.growth):
+            return []
+        save(growth_figure(self.growth, list(self.study.rows)), path)
+        return [f"![Mean error of free markers over time, per cable]({path.name})"]
 
     @property
     def labels(self) -> dict[str, str]:
@@ -172,15 +185,6 @@ TAG_SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "�
 """Tag of a published number to the sign behind it."""
 
 
-def clip_blocks(found: ClipNumbers) -> list[Block]:
-    """L1 per cable beside published numbers; ours in detail; every clip. Then the rows and runs that are not there, and why."""
-    lines = [f"{label}: not run" for label in found.study.rows if label not in set(found.clips["label"])]
-    failed = found.records[found.records["status"] != "ok"].itertuples()
-    lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
-    last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
-    return [_overview(found), *([_details(found)] if len(found.clips) else []), *last]
-
-
 def _overview(found: ClipNumbers) -> Table:
     cells, counts = found.cells, found.clips.groupby("cable", sort=False)["clip"].nunique()
     best, rows = cells[cells["ranked"].astype(bool)].groupby("cable")["l1_mm"].min(), []
@@ -213,18 +217,6 @@ def _details(found: ClipNumbers) -> Table:
     note += "Minutes: search and fit of one twin, mean over seeds; rows that share a search count it each."
     header = ["Cable", "Method", "Mean", "± seeds", "Median clip", "Worst clip", "Euclidean", "Minutes", "Worst", "Clips", "Seeds"]
     return replace(Table.of_texts(header, rows, "Ours in detail"), note=note, stub=2)
-
-
-def clip_files(found: ClipNumbers, folder: Path) -> list[str]:
-    """Write the CSV files and the figure; Markdown lines that show them."""
-    for suffix, rows in {"": found.cells, "_clips": found.clips}.items():
-        write_text(folder / f"{found.name}{suffix}.csv", rows.to_csv(index=False))
-    path = folder / f"{found.name}_growth.png"
-    path.unlink(missing_ok=True)
-    if not len(found.growth):
-        return []
-    save(growth_figure(found.growth, list(found.study.rows)), path)
-    return [f"![Mean error of free markers over time, per cable]({path.name})"]
 
 
 def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:

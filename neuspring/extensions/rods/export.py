@@ -46,37 +46,34 @@ class to_mujoco:
 
     def add(self, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
         """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
-        _add(self.rod, self.radius, root, world, meets)
-
-
-def _add(rod: Rod, radius: float, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
-    edges = len(rod.lengths)
-    mass, bend, twist, frames, rest, held = chain_of(rod)
-    pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
-    parent = world
-    at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
-    for j in range(edges):
-        parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
-        if j:
-            for axis, k in zip(HINGE_AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
-                law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
-                ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=HINGE_AXES[axis], **law)
-            pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
-        else:
-            ET.SubElement(parent, "freejoint", name="joint0")
-        along: dict[str, Any] = {"type": "capsule", "fromto": text(0, 0, 0, rod.lengths[j], 0, 0), "mass": text(mass[j])}
-        ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
-        for n in np.flatnonzero(rod.edge == j):
-            f, a, b = rod.place[n]
-            ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
-        if j + 1 < edges:
-            at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
-    equality = ET.SubElement(root, "equality") if held else root
-    for number, edge in held.items():
-        quat = text(*frames[edge].as_quat(scalar_first=True))
-        ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
-        ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose="0 0 0 1 0 0 0", **WELD)
-    ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
+        rod, radius = self.rod, self.radius
+        edges = len(rod.lengths)
+        mass, bend, twist, frames, rest, held = chain_of(rod)
+        pose = [*rod.vertices[0], *frames[0].as_quat(scalar_first=True)]
+        parent = world
+        at: dict[str, Any] = {"pos": text(*rod.vertices[0]), "quat": text(*pose[3:])}
+        for j in range(edges):
+            parent = ET.SubElement(parent, "body", name=f"edge{j}", **at)
+            if j:
+                for axis, k in zip(HINGE_AXES, (twist[j - 1], bend[j - 1], bend[j - 1]), strict=True):
+                    law: dict[str, Any] = {"stiffness": text(k), "damping": text(rod.damping * k)}
+                    ET.SubElement(parent, "joint", name=f"joint{j}{axis}", type="hinge", axis=HINGE_AXES[axis], **law)
+                pose += (rest[j - 1].inv() * frames[j - 1].inv() * frames[j]).as_euler("XYZ").tolist()
+            else:
+                ET.SubElement(parent, "freejoint", name="joint0")
+            along: dict[str, Any] = {"type": "capsule", "fromto": text(0, 0, 0, rod.lengths[j], 0, 0), "mass": text(mass[j])}
+            ET.SubElement(parent, "geom", size=text(radius), **along, **meets)
+            for n in np.flatnonzero(rod.edge == j):
+                f, a, b = rod.place[n]
+                ET.SubElement(parent, "site", name=f"node{n}", pos=text(f * rod.lengths[j], a, b), size=text(radius / 4))
+            if j + 1 < edges:
+                at = {"pos": text(rod.lengths[j], 0, 0), "quat": text(*rest[j].as_quat(scalar_first=True))}
+        equality = ET.SubElement(root, "equality") if held else root
+        for number, edge in held.items():
+            quat = text(*frames[edge].as_quat(scalar_first=True))
+            ET.SubElement(world, "body", name=f"clamp{number}", pos=text(*rod.vertices[edge]), quat=quat, mocap="true")
+            ET.SubElement(equality, "weld", body1=f"clamp{number}", body2=f"edge{edge}", relpose="0 0 0 1 0 0 0", **WELD)
+        ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qpos=text(*pose))
 
 
 class Chain(NamedTuple):

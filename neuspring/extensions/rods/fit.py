@@ -32,7 +32,7 @@ from neuspring.core.files import write_table
 from neuspring.core.text import Progress
 from neuspring.extensions.rods import made
 from neuspring.extensions.rods.nodes import PARALLEL, RodFrames, settled
-from neuspring.extensions.rods.rod import Rod, rod_of
+from neuspring.extensions.rods.rod import Rod, arc_of, rod_of
 from neuspring.extensions.rods.settings import RodFit
 from neuspring.physics.controllers import waypoints
 from neuspring.twin.body import Learned
@@ -203,12 +203,12 @@ class Variables:
         lengths = start.lengths * ratio
         place = start.place.copy()
         # Distance from the middle of the first edge.
-        at = np.concatenate([[0.0], start.lengths.cumsum()])[start.edge] + place[:, 0] * start.lengths[start.edge]
+        at = arc_of(start.lengths)[start.edge] + place[:, 0] * start.lengths[start.edge]
         at = at - start.lengths[0] / 2 + lengths[0] / 2 - moved[0, 0]
         by = self.part(q, "places").reshape(-1, 3)
         at[: len(by)] += by[:, 0]
         place[: len(by), 1:] += by[:, 1:]
-        arc = np.concatenate([[0.0], lengths.cumsum()])
+        arc = arc_of(lengths)
         edge = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(lengths) - 1)
         place[:, 0] = (at - arc[edge]) / lengths[edge]
         return {"lengths": lengths, "edge": edge.astype(np.int32), "place": place}
@@ -219,7 +219,7 @@ def free_part(rod: Rod) -> tuple[float, float]:
 
     They are those of the joints at the ends, or the ends of what bends where vertices were laid out, whose number is arbitrary.
     """
-    arc = np.concatenate([[0.0], np.cumsum(rod.lengths)])
+    arc = arc_of(rod.lengths)
     if not rod.laid:
         return float(arc[1]), float(arc[-2])
     return float(arc[1] / 2), float(arc[-1] - (rod.held[-1] >= 0) * rod.lengths[-1] / 2)
@@ -236,7 +236,7 @@ def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
         return np.ones((joints + 2, 1))
     from scipy.interpolate import CubicSpline
 
-    arc, (low, high) = np.concatenate([[0.0], np.cumsum(rod.lengths)]), free_part(rod)
+    arc, (low, high) = arc_of(rod.lengths), free_part(rod)
     return np.asarray(CubicSpline(np.linspace(low, high, knots), np.eye(knots), bc_type="natural")(np.clip(arc, low, high)))
 
 

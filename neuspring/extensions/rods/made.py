@@ -25,7 +25,7 @@ from neuspring.core.artifacts import Observations, Simulation, Twin
 from neuspring.core.errors import InputError
 from neuspring.extensions.rods.center_line import center_line
 from neuspring.extensions.rods.nodes import bound, frame_zero, hanging, place_on, placed, radius_of, settled
-from neuspring.extensions.rods.rod import Rod, rod_of
+from neuspring.extensions.rods.rod import Rod, arc_of, pieces, rod_of
 from neuspring.extensions.rods.settings import RodSettings
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import build, controller_reach, controller_springs, infer_controller_radius, node_spacing
@@ -86,7 +86,7 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
             vertices, held = laid_out(observations, start.lay_out, held)
     if not len(pairs) and not (held >= 0).any():
         raise InputError(where, "a hand must hold the rod", "none does", "Raise search.variables.controller_radius.start.")
-    lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
+    lengths = pieces(vertices)
     # Of a vertex: half of each of its edges.
     own = np.convolve(lengths, [0.5, 0.5])
     density = len(nodes) / lengths.sum() if len(pairs) else 1.0
@@ -169,7 +169,7 @@ def on_recording(twin: Twin, observations: Observations) -> Twin:
         material = replace(material, stiffness=np.full(len(pairs), stiffness), dashpot=np.full(len(pairs), dashpot))
     else:
         topology, vertices = build(nodes, hands, here.springs), line_of(observations)
-    found = np.linalg.norm(np.diff(vertices, axis=0), axis=1).sum() / rod.lengths.sum()
+    found = pieces(vertices).sum() / rod.lengths.sum()
     if abs(found - 1) > MOST_STRETCH:
         rule = f"the center line must be as long as the twin's within {MOST_STRETCH:.0%}: {rod.lengths.sum():.3f} m"
         raise InputError(where, rule, f"{found * rod.lengths.sum():.3f} m", "Name a recording of the same body.")
@@ -204,7 +204,7 @@ def laid_out(observations: Observations, count: int, held: np.ndarray) -> tuple[
 def _unloaded(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
     """Places of the line [M, 3], m, without load, and their distances along it [M], m."""
     places = observations.canonical[observations.line].astype(np.float64)
-    return places, np.concatenate([[0.0], np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum()])
+    return places, arc_of(pieces(places))
 
 
 def _along(arc: np.ndarray, places: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -255,7 +255,7 @@ def hung(twins: Sequence[Twin], recordings: Sequence[Observations]) -> list[Twin
     for twin, seen in zip(twins, recordings, strict=True):
         rod = rod_of(twin)
         # Rest is sought from the line that was seen.
-        arc, at = _unloaded(seen)[1], np.concatenate([[0.0], rod.lengths.cumsum()]) - rod.lengths[0] / 2
+        arc, at = _unloaded(seen)[1], arc_of(rod.lengths) - rod.lengths[0] / 2
         rods.append(replace(rod, vertices=_along(arc - arc[1], line_of(seen), at)))
     hands = np.stack([seen.controller_points[0] for seen in recordings])
     vertices, directors, axes = hanging(rods, hands, twins[0].simulation)

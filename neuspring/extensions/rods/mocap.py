@@ -36,6 +36,7 @@ from neuspring.core.findings import refuse
 from neuspring.core.records import digest_file
 from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.rods.checks import MIN_DISTANCE, MIN_FRAMES, in_space, look
+from neuspring.extensions.rods.rod import arc_of, pieces
 from neuspring.extensions.rods.settings import Mocap
 
 X, Y, Z = np.eye(3)
@@ -216,8 +217,8 @@ def centerline(markers: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray
 
 def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.ndarray]:
     """Spline through the markers, its parameters at the markers, dense parameters, and the arc length, m, at each dense one."""
-    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(markers, axis=0), axis=1))])
+    knots = arc_of(pieces(markers))
     spline = CubicSpline(knots, markers, bc_type="natural")
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(dense), axis=0), axis=1))])
+    arc = arc_of(pieces(spline(dense)))
     return spline, knots, dense, arc

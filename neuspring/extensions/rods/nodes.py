@@ -19,7 +19,7 @@ import torch
 from neuspring.core.artifacts import Simulation, Twin
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.extensions.rods.rod import Rod, rod_of
-from neuspring.extensions.rods.solver import RodHands, RodLanes, RodSolver
+from neuspring.extensions.rods.solver import RodHands, RodSolver
 from neuspring.physics.controllers import ControllerSprings
 from neuspring.physics.parameters import CONTACT_LIMITS
 
@@ -58,7 +58,7 @@ def bound(rod: Rod, nodes: np.ndarray) -> Rod:
 def frame_zero(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     """Directors m1 of edges [E, 3] and curvatures k1, k2 of joints [V, 2], 1, in frame 0."""
     require_axis(rod)
-    solver = RodSolver(RodLanes.of([rod], [0.0]), Simulation(frame_time=1.0, substeps=1))
+    solver = RodSolver([rod], [0.0], Simulation(frame_time=1.0, substeps=1))
     solver.start(torch.tensor(rod.vertices)[None], torch.zeros((1, *rod.vertices.shape), dtype=torch.float64))
     return solver.directors()[0].numpy().copy(), solver.curvatures[0].numpy().copy()
 
@@ -149,7 +149,7 @@ def hanging(rods: Sequence[Rod], controllers: np.ndarray, simulation: Simulation
     step = 0.5 * (length / max(simulation.gravity, TINY_GRAVITY)) ** 0.5
     plain = [replace(rod, damping=0.0, drag_quadratic=0.0, slip=rod.slip[:0]) for rod in rods]
     still = replace(simulation, frame_time=step, substeps=1, ground=False)
-    solver = RodSolver(RodLanes.of(plain, [0.0] * len(rods)), still)
+    solver = RodSolver(plain, [0.0] * len(rods), still)
     x = torch.tensor(np.stack([rod.vertices for rod in rods]))
     solver.start(x, torch.zeros_like(x), axes[0])
     found, _ = solver.frames(held.expand(STEPS_TO_REST + 1, -1, -1, -1), still=True)
@@ -168,7 +168,7 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
     free = rods[0].held < 0
     clamps = Clamps.of(rods)
     offsets = torch.tensor(np.stack([rod.offsets for rod in rods]))[:, free]
-    solver = RodSolver(RodLanes.of(rods, [0.0] * len(rods)), Simulation(frame_time=1.0, substeps=1))
+    solver = RodSolver(rods, [0.0] * len(rods), Simulation(frame_time=1.0, substeps=1))
     x = clamps.moved(points, clamps.axes)
     edges = np.minimum(np.flatnonzero(free), len(free) - 2)
     for _ in range(SETTLING):
@@ -250,7 +250,7 @@ class RodFrames:
         self._packed = self._tensor([_packed(twin) for twin in every])
         hands = self._hands(every)
         drags = [twin.material.drag for twin in every]
-        self.solver = RodSolver(RodLanes.of(self.rods, drags), simulation, device, hands)
+        self.solver = RodSolver(self.rods, drags, simulation, device, hands)
         self._edge = torch.tensor(np.stack([rod.edge for rod in self.rods]), dtype=torch.long, device=device)
         self._place = self._tensor([rod.place for rod in self.rods])
         self._clamps = Clamps.of(self.rods, device)

@@ -125,6 +125,16 @@ class Rod(BodyData):
         return np.convolve(self.lengths, [0.5, 0.5])
 
 
+def pieces(line: np.ndarray) -> np.ndarray:
+    """Distances from each point of a line [n, 3] to the next [n - 1], m."""
+    return np.asarray(np.linalg.norm(np.diff(line, axis=0), axis=1))
+
+
+def arc_of(lengths: np.ndarray) -> np.ndarray:
+    """Distances of the points of a line from its first [n + 1], m, from those between them [n]."""
+    return np.concatenate([[0.0], np.cumsum(lengths)])
+
+
 def rod_of(twin: Twin) -> Rod:
     """The rod of a twin."""
     assert isinstance(twin.body, Rod)

@@ -148,6 +148,18 @@ def turn(a: vec3, b: vec3, t: vec3):
 
 
 @wp.func
+def edge_length(s: RodState, lane: int, j: int):
+    """Length of edge j at the positions p, m."""
+    return wp.length(s.p[lane, j + 1] - s.p[lane, j])
+
+
+@wp.func
+def clamp_angle(s: RodState, lane: int, j: int, end: int):
+    """Angle of the axis of an end from the reference director of edge j."""
+    return turn(s.u[lane, j], projected(s.axis[lane, end], s.t[lane, j]), s.t[lane, j])
+
+
+@wp.func
 def near(angle: real, before: real):
     """The angle plus the multiple of 2 pi that brings it nearest to `before`."""
     circle = real(6.283185307179586)
@@ -321,8 +333,7 @@ def begin(s: RodState):
         total += s.lengths[lane, j]
     end = real(0.0)
     if last_held:
-        last = edges - 1
-        end = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
+        end = s.roll[lane] + clamp_angle(s, lane, edges - 1, 1)
     along = real(0.0)
     for j in range(edges):
         s.theta[lane, j] = end * along / (total - s.lengths[lane, edges - 1])
@@ -372,8 +383,8 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
     middle = inverse * (before + after)
     n1 = inverse * (s.m1[lane, i - 1] + s.m1[lane, i])
     n2 = inverse * (s.m2[lane, i - 1] + s.m2[lane, i])
-    r0 = real(1.0) / wp.length(s.p[lane, i] - s.p[lane, i - 1])
-    r1 = real(1.0) / wp.length(s.p[lane, i + 1] - s.p[lane, i])
+    r0 = real(1.0) / edge_length(s, lane, i - 1)
+    r1 = real(1.0) / edge_length(s, lane, i)
     kb = s.kb[lane, i]
     half = real(0.5)
     cosine = wp.dot(before, after)
@@ -463,7 +474,7 @@ def assemble_stretching(s: RodState, lane: int, edges: int):
     unit = wp.identity(n=3, dtype=real)
     for j in range(edges):
         t = s.t[lane, j]
-        length = wp.length(s.p[lane, j + 1] - s.p[lane, j])
+        length = edge_length(s, lane, j)
         y = s.stretching[lane] / s.lengths[lane, j]
         force = y * (length - s.lengths[lane, j])
         along = wp.outer(t, t)
@@ -490,7 +501,7 @@ def assemble_hands(s: RodState, lane: int, rate: real, more: real):
             at = s.spring_place[lane, k]
             t = s.t[lane, j]
             o = at[1] * s.m1[lane, j] + at[2] * s.m2[lane, j]
-            turned = wp.outer(t, o) / wp.length(s.p[lane, j + 1] - s.p[lane, j])
+            turned = wp.outer(t, o) / edge_length(s, lane, j)
             j0 = (real(1.0) - at[0]) * unit + turned
             j1 = at[0] * unit - turned
             arm = wp.cross(t, o)
@@ -643,13 +654,10 @@ def advance(
                 s.axis[lane, end] = axes[frame, lane, end] + part * (axes[frame + 1, lane, end] - axes[frame, lane, end])
             # The directors of clamps keep to the axis, whatever way the tangents took.
             if first_held:
-                s.theta[lane, 0] = near(
-                    turn(s.u[lane, 0], projected(s.axis[lane, 0], s.t[lane, 0]), s.t[lane, 0]), s.theta[lane, 0]
-                )
+                s.theta[lane, 0] = near(clamp_angle(s, lane, 0, 0), s.theta[lane, 0])
             if last_held:
                 last = edges - 1
-                angle = s.roll[lane] + turn(s.u[lane, last], projected(s.axis[lane, 1], s.t[lane, last]), s.t[lane, last])
-                s.theta[lane, last] = near(angle, s.theta[lane, last])
+                s.theta[lane, last] = near(s.roll[lane] + clamp_angle(s, lane, last, 1), s.theta[lane, last])
             set_directors(s, lane, edges)
             for i in range(4 * vertices):
                 s.b[lane, i] = real(0.0)
@@ -690,7 +698,7 @@ def advance(
                 s.v[lane, i] = v
             for j in range(edges):
                 d = s.x[lane, j + 1] - s.p[lane, j + 1] - s.x[lane, j] + s.p[lane, j]
-                length = wp.length(s.p[lane, j + 1] - s.p[lane, j]) + wp.dot(s.t[lane, j], d)
+                length = edge_length(s, lane, j) + wp.dot(s.t[lane, j], d)
                 s.tension[lane, j] = s.stretching[lane] * (length / s.lengths[lane, j] - real(1.0))
             for i in range(1, edges):
                 s.k_before[lane, i] = s.k[lane, i]
@@ -721,38 +729,6 @@ def advance(
 
 
 @dataclass(frozen=True)
-class RodLanes:
-    """Parameters of B rods with as many vertices, float64 on the CPU: those of `Rod` with a leading axis [B].
-
-    `axis` [B, 2, 3] is that of either end.
-    """
-
-    lengths: np.ndarray
-    mass: np.ndarray
-    bending: np.ndarray
-    twisting: np.ndarray
-    curvature: np.ndarray
-    axis: np.ndarray
-    stretching: np.ndarray
-    damping: np.ndarray
-    drag_quadratic: np.ndarray
-    roll: np.ndarray
-    slip: np.ndarray
-    slip_twist: np.ndarray
-    by_angle: np.ndarray
-    drag: np.ndarray
-    """Linear drag, 1/s."""
-    held: np.ndarray
-
-    @classmethod
-    def of(cls, rods: Sequence[Rod], drags: Sequence[float]) -> "RodLanes":
-        """Lanes of rods and their linear drags, 1/s."""
-        values = {each.name: np.array([getattr(rod, each.name) for rod in rods]) for each in fields(cls) if each.name != "drag"}
-        values["axis"] = np.repeat(values["axis"][:, None], 2, axis=1)
-        return cls(**values, drag=np.array(drags, dtype=np.float64))
-
-
-@dataclass(frozen=True)
 class RodHands:
     """Forces on B rods besides clamps: S springs of controllers, and the ground."""
 
@@ -765,27 +741,40 @@ class RodHands:
     friction: np.ndarray
 
 
+OF_RODS = [each.name for each in fields(Rod) if each.name in RodState.vars]
+"""Parameters that are those of `Rod`, with a leading axis [B]."""
 OF_HANDS = ("spring_edge", "spring_place", "law", "hands")
 """State of springs, which another solver of the same rods may have others of."""
-STATE = [name for name in RodState.vars if name not in (*OF_HANDS, *(each.name for each in (*fields(RodLanes), *fields(RodHands))))]
+STATE = [name for name in RodState.vars if name not in (*OF_RODS, "drag", *OF_HANDS, *(each.name for each in fields(RodHands)))]
 """State that `RodSolver.follow` takes over."""
 
 
 class RodSolver:
     """Simulates frames of rods in lanes. Tensors are float64 and have a leading axis [B]."""
 
-    def __init__(self, lanes: RodLanes, simulation: Simulation, device: str = "cpu", hands: RodHands | None = None) -> None:
-        self.lanes, self.simulation, self.device, self.hands = lanes, simulation, device, hands
-        count, vertices = lanes.mass.shape
+    def __init__(
+        self,
+        rods: Sequence[Rod],
+        drags: Sequence[float],
+        simulation: Simulation,
+        device: str = "cpu",
+        hands: RodHands | None = None,
+    ) -> None:
+        """Rods with as many vertices, each with its linear drag, 1/s."""
+        self.rods, self.simulation, self.device, self.hands = rods, simulation, device, hands
+        count, vertices = len(rods), len(rods[0].mass)
         self.count, self.vertices = count, vertices
         springs, controllers = (hands.leader.shape[1], hands.controllers) if hands else (0, 0)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("spring_edge", "spring_place", "law", "leader"), (count, springs))
         shapes |= dict.fromkeys(("history", "elasticity", "friction"), (count,))
-        shapes |= {"hands": (count, controllers), "z": (count, vertices, lanes.slip.shape[1])}
+        shapes |= {"hands": (count, controllers), "z": (count, vertices, len(rods[0].slip))}
         shapes |= {"a": (count, 4 * vertices, 11), "w": (count, 3, 11), "b": (count, 4 * vertices)}
+        values = {name: np.array([getattr(rod, name) for rod in rods]) for name in OF_RODS}
+        # Either end has an axis.
+        values |= {"axis": np.repeat(values["axis"][:, None], 2, axis=1), "drag": np.array(drags, np.float64)}
         self._state = RodState()
         for name, variable in RodState.vars.items():
-            given, kind = getattr(lanes, name, getattr(hands, name, None)), variable.type.dtype
+            given, kind = values.get(name, getattr(hands, name, None)), variable.type.dtype
             if given is None:
                 array = wp.zeros(shapes.get(name, (count, vertices)), dtype=kind, device=device)
             else:

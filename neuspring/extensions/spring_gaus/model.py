@@ -48,11 +48,6 @@ class SpringGausTraining(SpringGaus):
     velocity_rate: float = 2.5e-4
     """Adam's learning rate of the initial velocity, which all anchors share, m/s."""
 
-    @classmethod
-    def of(cls, settings: SpringGaus) -> SpringGausTraining:
-        """The training that the settings ask for."""
-        return cls(**vars(settings))
-
 
 @dataclass(frozen=True, kw_only=True)
 class SpringGausModel(AnchorGraph, AnchorPhysics):

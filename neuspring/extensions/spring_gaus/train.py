@@ -28,12 +28,12 @@ from neuspring.baselines.results import DIVERGENCE_RADIUS, Trained, TrainingStop
 from neuspring.config import Config
 from neuspring.core.checkpoint import Checkpoint, adam_arrays, restore_adam
 from neuspring.core.errors import InputError
-from neuspring.core.weights import read_tensors
 from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import masks_of_cameras
 from neuspring.extensions.spring_gaus.baseline import find_vgg16
 from neuspring.extensions.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
 from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver
+from neuspring.scores.lpips import read_layers
 from neuspring.splats.draw import view_of
 from neuspring.splats.losses import ssim
 from neuspring.splats.model import Gaussians, Splats
@@ -79,7 +79,7 @@ class Problem:
 def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     """Train on silhouettes, or on points. Raises InputError for `supervision: masks` without pictures."""
     observations, settings, device = request.observations, request.settings, request.device
-    chosen, scenario = SpringGausTraining.of(settings.baselines.spring_gaus), observations.scenario
+    chosen, scenario = SpringGausTraining(**vars(settings.baselines.spring_gaus)), observations.scenario
     pictures = request.pictures if chosen.supervision == "masks" else None
     if chosen.supervision == "masks" and pictures is None:
         rule = "supervision: masks needs --capture, --masks and --appearance"
@@ -288,17 +288,17 @@ def total_variation(picture: torch.Tensor) -> torch.Tensor:
     return (picture[1:] - picture[:-1]).square().mean() + (picture[:, 1:] - picture[:, :-1]).square().mean()
 
 
+def vgg16() -> Sequential:
+    """The first convolutions of VGG16, in torchvision's order."""
+    return Sequential(
+        *(Conv2d(3, 64, 3, padding=1), ReLU(), Conv2d(64, 64, 3, padding=1), ReLU(), MaxPool2d(2)),
+        *(Conv2d(64, 128, 3, padding=1), ReLU(), Conv2d(128, 128, 3, padding=1), ReLU()),
+    )
+
+
 def load_features(path: Path, device: str) -> Callable[[torch.Tensor], torch.Tensor]:
     """Pictures [B, 3, H, W] in 0..1 -> features [B, 128, H / 2, W / 2], differentiably. Raises InputError for a damaged file."""
-    # Layers without memory: the tensors of the file become their parameters.
-    with torch.device("meta"):
-        layers = Sequential(
-            *(Conv2d(3, 64, 3, padding=1), ReLU(), Conv2d(64, 64, 3, padding=1), ReLU(), MaxPool2d(2)),
-            *(Conv2d(64, 128, 3, padding=1), ReLU(), Conv2d(128, 128, 3, padding=1), ReLU()),
-        ).requires_grad_(False)
-    shapes = {f"features.{name}": tuple(parameter.shape) for name, parameter in layers.named_parameters()}
-    tensors = read_tensors(path, shapes, device)
-    layers.load_state_dict(dict(zip(layers.state_dict(), tensors, strict=True)), assign=True)
+    layers = read_layers(path, vgg16, device)
 
     def features(pictures: torch.Tensor) -> torch.Tensor:
         mean, deviation = (pictures.new_tensor(values)[:, None, None] for values in (IMAGENET_MEANS, IMAGENET_DEVIATIONS))

@@ -7,7 +7,7 @@ a zebra on its four legs, a dinosaur that sits on its legs and tail. x points to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -383,13 +383,18 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
     )
 
 
+def _level(points: np.ndarray, center: Sequence[float], radii: float | Sequence[float] = 1.0) -> np.ndarray:
+    """Distances of points from a center, in radii of an ellipsoid."""
+    return np.asarray(np.linalg.norm((points - np.array(center)) / radii, axis=1))
+
+
 def _paint_sloth(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
     colors = np.tile([0.38, 0.26, 0.15], (len(points), 1))
-    face = np.linalg.norm((points - [0.135, 0, 0.068]) / [0.03, 0.04, 0.032], axis=1) < 1.0
+    face = _level(points, [0.135, 0, 0.068], [0.03, 0.04, 0.032]) < 1.0
     colors[face] = [0.8, 0.68, 0.48]
     colors[parts["snout"](points) < 0.002] = [0.12, 0.07, 0.05]
     for side in (1, -1):
-        eye = np.linalg.norm(points - [0.132, 0.022 * side, 0.08], axis=1)
+        eye = _level(points, [0.132, 0.022 * side, 0.08])
         colors[eye < 0.012] = [0.2, 0.12, 0.08]
         colors[eye < 0.006] = [0.01, 0.01, 0.01]
     tips = (np.abs(points[:, 1]) > 0.115) | ((points[:, 0] < -0.1) & (np.abs(points[:, 1]) > 0.075))
@@ -409,13 +414,13 @@ def _paint_zebra(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
     mane = (np.abs(points[:, 1]) < 0.008) & (points[:, 2] > 0.13) & (points[:, 0] < 0.1)
     colors[mane] = [0.03, 0.03, 0.03]
     for side in (1, -1):
-        colors[np.linalg.norm(points - [0.128, 0.026 * side, 0.172], axis=1) < 0.007] = [0.3, 0.16, 0.05]
+        colors[_level(points, [0.128, 0.026 * side, 0.172]) < 0.007] = [0.3, 0.16, 0.05]
     return colors
 
 
 def _paint_dinosaur(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
     colors = np.tile([0.16, 0.42, 0.2], (len(points), 1))
-    belly = np.linalg.norm((points - [0.05, 0, 0.075]) / [0.03, 0.036, 0.055], axis=1) < 1.0
+    belly = _level(points, [0.05, 0, 0.075], [0.03, 0.036, 0.055]) < 1.0
     colors[belly] = [0.75, 0.72, 0.42]
     cell = np.floor(points / 0.018).astype(int)
     speckled = ((cell * [7, 13, 29]).sum(axis=1) % 5 == 0) & ~belly
@@ -424,7 +429,7 @@ def _paint_dinosaur(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
         if name.startswith("spike"):
             colors[parts[name](points) < 0.003] = [0.75, 0.35, 0.08]
     for side in (1, -1):
-        eye = np.linalg.norm(points - [0.095, 0.024 * side, 0.19], axis=1)
+        eye = _level(points, [0.095, 0.024 * side, 0.19])
         colors[eye < 0.01] = [0.85, 0.85, 0.8]
         colors[eye < 0.006] = [0.01, 0.01, 0.01]
     return colors

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from neuspring.config.perception import PointTracking
 from neuspring.data.capture import HANDS, OBJECT, Capture
 from neuspring.data.results import ShapePrior
+from neuspring.extensions.synthetic.scenes import place
 from neuspring.extensions.synthetic.truth import truth_of, under_pixels
 from neuspring.perception.track_opencv import Followed, choose
 
@@ -48,7 +49,7 @@ def surface(capture: Capture) -> ShapePrior:
 def carried(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """[T, n, 3], m: where points [n, 3] of frame 0 go with a rigid body of poses [T, 7] (position, quaternion x y z w)."""
     local = Rotation.from_quat(poses[0, 3:]).inv().apply(points - poses[0, :3])
-    return np.stack([Rotation.from_quat(pose[3:]).apply(local) + pose[:3] for pose in poses])
+    return place(local, poses)
 
 
 def _with_nearest_hand(poses: np.ndarray, points: np.ndarray) -> np.ndarray:

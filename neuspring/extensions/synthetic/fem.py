@@ -22,6 +22,7 @@ from neuspring.extensions.synthetic import kernels
 from neuspring.extensions.synthetic.bodies import SoftBody
 from neuspring.extensions.synthetic.meshes import edges, volumes
 from neuspring.extensions.synthetic.scenes import FIST_RADIUS, Hand
+from neuspring.scenes.rays import on_cpu
 
 if TYPE_CHECKING:
     import newton
@@ -253,10 +254,10 @@ class FiniteElements:
         strain = 0.5 * (np.swapaxes(gradient, 1, 2) @ gradient - np.eye(3))
         mu, first = lame(share * body.youngs_modulus, body.poisson_ratio)
         return [
-            wp.array(body.tetrahedra, dtype=wp.int32, device="cpu"),
-            wp.array(inverse, dtype=wp.mat33, device="cpu"),
-            *(wp.array(values, dtype=wp.float32, device="cpu") for values in (self.volumes, mu, first)),
-            wp.array(strain, dtype=wp.mat33, device="cpu"),
+            on_cpu(body.tetrahedra, wp.int32),
+            on_cpu(inverse, wp.mat33),
+            *(on_cpu(values, wp.float32) for values in (self.volumes, mu, first)),
+            on_cpu(strain, wp.mat33),
             wp.zeros(len(body.tetrahedra), dtype=wp.mat33, device="cpu"),
         ]
 
@@ -280,12 +281,12 @@ class FiniteElements:
         self.model.particle_inv_mass.assign(inverse.astype(np.float32))
         for state in (self.now, self.next):
             state.particle_q.assign(self.start.astype(np.float32))
-        self._poses: wp.array = wp.array(poses, dtype=wp.transform, device="cpu")
-        self._holder: wp.array = wp.array(holder, dtype=wp.int32, device="cpu")
-        self._local: wp.array = wp.array(local, dtype=wp.vec3, device="cpu")
-        self._fists: wp.array = wp.array(np.array(fists, dtype=np.int32), dtype=wp.int32, device="cpu")
+        self._poses = on_cpu(poses, wp.transform)
+        self._holder = on_cpu(holder, wp.int32)
+        self._local = on_cpu(local, wp.vec3)
+        self._fists = on_cpu(np.array(fists, dtype=np.int32), wp.int32)
         self._step = wp.zeros(1, dtype=wp.int32, device="cpu")
-        self._sums = wp.zeros(16, dtype=wp.float32, device="cpu")
+        self._sums = wp.zeros(19, dtype=wp.float32, device="cpu")
 
     def _frame(self) -> None:
         """One frame, in runs of substeps that repeat: the first of a length compiles, the second is recorded, others replay it."""
@@ -301,12 +302,11 @@ class FiniteElements:
 
     def _substeps(self, count: int) -> None:
         """The first substeps of a frame; every PERIOD they begin again."""
-        model, dt, contacts = self.model, self.substep, self.contacts
+        dt, contacts = self.substep, self.contacts
         for k in range(count):
             now, following = self.now, self.next
             now.clear_forces()
-            held = [self._step, self._poses, self._holder, self._local, dt, now.particle_q, now.particle_qd]
-            wp.launch(kernels.drive_nodes, model.particle_count, held, device="cpu")
+            self._drive(now)
             if len(self._fists):
                 pushed = [self._step, self._poses, self._fists, dt, now.body_q, now.body_qd]
                 wp.launch(kernels.drive_bodies, len(self._fists), pushed, device="cpu")
@@ -319,6 +319,11 @@ class FiniteElements:
                 self._damp(following, DAMP_EVERY * dt)
             wp.launch(kernels.advance, 1, [self._step], device="cpu")
             self.now, self.next = following, now
+
+    def _drive(self, state: newton.State) -> None:
+        """Put held nodes where their hands are."""
+        held = [self._step, self._poses, self._holder, self._local, self.substep, state.particle_q, state.particle_qd]
+        wp.launch(kernels.drive_nodes, self.model.particle_count, held, device="cpu")
 
     def _add_maxwell(self, state: newton.State, decay: float, fresh: bool = False) -> None:
         """Forces of the Maxwell branch; `fresh`: of one without strain and stress, whose own stay."""
@@ -481,8 +486,7 @@ class VertexBlockDescent(FiniteElements):
             now.clear_forces()
             # Held nodes do not move within a step: they are put where they are at its end.
             wp.launch(kernels.advance, 1, [self._step], device="cpu")
-            held = [self._step, self._poses, self._holder, self._local, self.substep, now.particle_q, now.particle_qd]
-            wp.launch(kernels.drive_nodes, self.model.particle_count, held, device="cpu")
+            self._drive(now)
             self.pipeline.collide(now, self.contacts)
             self.solver.step(now, following, self.control, self.contacts, self.substep)
             self.now, self.next = following, now

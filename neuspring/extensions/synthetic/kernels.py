@@ -85,13 +85,11 @@ def maxwell(
     strain[t] = green
     stress[t] = now
     h = (gradient * now) * wp.transpose(inverse_rest[t]) * volume[t]
-    on_b = wp.vec3(h[0, 0], h[1, 0], h[2, 0])
-    on_c = wp.vec3(h[0, 1], h[1, 1], h[2, 1])
-    on_d = wp.vec3(h[0, 2], h[1, 2], h[2, 2])
-    wp.atomic_sub(force, b, on_b)
-    wp.atomic_sub(force, c, on_c)
-    wp.atomic_sub(force, d, on_d)
-    wp.atomic_add(force, a, on_b + on_c + on_d)
+    on = wp.transpose(h)
+    wp.atomic_sub(force, b, on[0])
+    wp.atomic_sub(force, c, on[1])
+    wp.atomic_sub(force, d, on[2])
+    wp.atomic_add(force, a, on[0] + on[1] + on[2])
 
 
 @wp.kernel(enable_backward=False)
@@ -145,7 +143,7 @@ def coulomb(
 
 @wp.kernel(enable_backward=False)
 def moments(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], mass: wp.array[float], sums: wp.array[float]):
-    """Mass, first moments, momentum, angular momentum about the origin, second moments."""
+    """Mass, first moments, momentum, angular momentum about the origin, second moments (3 x 3, the upper half)."""
     i = wp.tid()
     m = mass[i]
     x = position[i]
@@ -156,12 +154,8 @@ def moments(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], mass: wp.a
         wp.atomic_add(sums, 1 + k, m * x[k])
         wp.atomic_add(sums, 4 + k, m * v[k])
         wp.atomic_add(sums, 7 + k, m * spin[k])
-    wp.atomic_add(sums, 10, m * x[0] * x[0])
-    wp.atomic_add(sums, 11, m * x[1] * x[1])
-    wp.atomic_add(sums, 12, m * x[2] * x[2])
-    wp.atomic_add(sums, 13, m * x[0] * x[1])
-    wp.atomic_add(sums, 14, m * x[0] * x[2])
-    wp.atomic_add(sums, 15, m * x[1] * x[2])
+        for other in range(k, 3):
+            wp.atomic_add(sums, 10 + 3 * k + other, m * x[k] * x[other])
 
 
 @wp.kernel(enable_backward=False)
@@ -183,11 +177,11 @@ def damp_deformation(
     mean = wp.vec3(sums[4], sums[5], sums[6]) / m
     spin = wp.vec3(sums[7], sums[8], sums[9]) - m * wp.cross(center, mean)
     xx = sums[10] - m * center[0] * center[0]
-    yy = sums[11] - m * center[1] * center[1]
-    zz = sums[12] - m * center[2] * center[2]
-    xy = sums[13] - m * center[0] * center[1]
-    xz = sums[14] - m * center[0] * center[2]
+    xy = sums[11] - m * center[0] * center[1]
+    xz = sums[12] - m * center[0] * center[2]
+    yy = sums[14] - m * center[1] * center[1]
     yz = sums[15] - m * center[1] * center[2]
+    zz = sums[18] - m * center[2] * center[2]
     # A straight rope has no moment of inertia about itself.
     least = 1.0e-3 * (xx + yy + zz)
     inertia = wp.mat33(yy + zz + least, -xy, -xz, -xy, xx + zz + least, -yz, -xz, -yz, xx + yy + least)

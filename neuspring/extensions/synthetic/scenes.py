@@ -83,7 +83,7 @@ MEAN_SPEED = 0.2
 Offsets = Sequence[Sequence[float] | np.ndarray]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SyntheticScene:
     """A body, how long it is filmed, and its hands for a settled shape."""
 
@@ -135,7 +135,7 @@ def lift(*places: Sequence[float], reach: float = 0.02, offsets: Offsets = LIFT,
     return hands
 
 
-def stretch(first: Sequence[float], second: Sequence[float], pull: float, reach: float = 0.022) -> Callable:
+def stretch(first: Sequence[float], second: Sequence[float], pull: float) -> Callable:
     """Two grips that lift the object and pull it apart along the line between them, again and again."""
 
     def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
@@ -146,7 +146,7 @@ def stretch(first: Sequence[float], second: Sequence[float], pull: float, reach:
         for point, side in zip(points, (1.0, -1.0), strict=True):
             far, up = side * pull * apart, np.array([0.0, 0.0, 0.1])
             offsets = [up, up + far, up * 1.3 + 0.2 * far, up + far * 0.8, up * 0.5]
-            grips.append(Hand(wander(point, offsets, duration), reach=reach))
+            grips.append(Hand(wander(point, offsets, duration), reach=0.022))
         return tuple(grips)
 
     return hands
@@ -181,32 +181,26 @@ def _package(spacing: float, skin: float) -> SoftBody:
 
 GRIPPED_CORNER, OTHER_CORNER, GRIPPED_MIDDLE = (1.0, 0.0, 0.5), (1.0, 1.0, 0.5), (0.5, 0.5, 0.5)
 SCENES: dict[str, SyntheticScene] = {
-    "double_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=116, hands=lift(GRIPPED_CORNER, OTHER_CORNER)),
-    "double_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=118, hands=lift(GRIPPED_CORNER, OTHER_CORNER)),
-    "single_clift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=80, hands=lift(GRIPPED_MIDDLE)),
-    "single_clift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=97, hands=lift(GRIPPED_MIDDLE)),
-    "single_lift_cloth": SyntheticScene(body=_cloth("towel"), frames=173, hands=lift(GRIPPED_CORNER)),
-    "single_lift_cloth_1": SyntheticScene(body=_cloth("napkin"), frames=110, hands=lift(OTHER_CORNER)),
-    "single_lift_cloth_3": SyntheticScene(body=_cloth("scarf"), frames=156, hands=lift(GRIPPED_CORNER)),
-    "single_lift_cloth_4": SyntheticScene(body=_cloth("sheet"), frames=172, hands=lift(GRIPPED_CORNER)),
-    "weird_package": SyntheticScene(body=_package, frames=39, hands=lift((1.0, 0.5, 1.0), reach=0.028, offsets=LOW_LIFT)),
-    "double_lift_sloth": SyntheticScene(body=bodies.sloth, frames=62, hands=lift((0.95, 0.0, 0.1), (0.95, 1.0, 0.1), reach=0.025)),
-    "double_stretch_sloth": SyntheticScene(body=bodies.sloth, frames=192, hands=stretch((0.9, 1.0, 0.2), (0.0, 0.1, 0.2), 0.05)),
-    "single_lift_sloth": SyntheticScene(body=bodies.sloth, frames=85, hands=lift((0.95, 1.0, 0.1), reach=0.025)),
-    "single_push_sloth": SyntheticScene(body=bodies.sloth, frames=68, hands=push((0.4, 0.1, 0.5), (0, 1, 0), 0.1)),
-    "double_lift_zebra": SyntheticScene(
-        body=bodies.zebra, frames=58, hands=lift((0.85, 0.5, 1.0), (0.15, 0.5, 0.75), reach=0.025, offsets=TOGETHER)
-    ),
-    "double_stretch_zebra": SyntheticScene(body=bodies.zebra, frames=198, hands=stretch((0.95, 0.5, 0.8), (0.1, 0.5, 0.6), 0.04)),
-    "single_lift_zebra": SyntheticScene(body=bodies.zebra, frames=66, hands=lift((0.4, 0.5, 1.0), reach=0.028)),
-    "single_lift_dinosor": SyntheticScene(
-        body=bodies.dinosaur, frames=86, hands=lift((0.0, 0.5, 0.1), reach=0.03, offsets=LOW_LIFT)
-    ),
-    "rope_double_hand": SyntheticScene(
-        body=_rope("twine"), frames=264, hands=lift((0.02, 0.5, 0.5), (0.98, 0.5, 0.5), reach=0.016), marked=True
-    ),
-    "single_lift_rope": SyntheticScene(body=_rope("cord"), frames=50, hands=lift((0.03, 0.5, 0.5), reach=0.016)),
-    "single_push_rope": SyntheticScene(body=_rope("twine"), frames=58, hands=push((0.5, 0.0, 0.5), (0, 1, 0), 0.1)),
-    "single_push_rope_1": SyntheticScene(body=_rope("twine"), frames=92, hands=push((0.25, 0.0, 0.5), (0.3, 1, 0), 0.12)),
-    "single_push_rope_4": SyntheticScene(body=_rope("cord"), frames=83, hands=push((0.7, 0.0, 0.5), (-0.2, 1, 0), 0.1)),
+    "double_lift_cloth_1": SyntheticScene(_cloth("napkin"), 116, lift(GRIPPED_CORNER, OTHER_CORNER)),
+    "double_lift_cloth_3": SyntheticScene(_cloth("scarf"), 118, lift(GRIPPED_CORNER, OTHER_CORNER)),
+    "single_clift_cloth_1": SyntheticScene(_cloth("napkin"), 80, lift(GRIPPED_MIDDLE)),
+    "single_clift_cloth_3": SyntheticScene(_cloth("scarf"), 97, lift(GRIPPED_MIDDLE)),
+    "single_lift_cloth": SyntheticScene(_cloth("towel"), 173, lift(GRIPPED_CORNER)),
+    "single_lift_cloth_1": SyntheticScene(_cloth("napkin"), 110, lift(OTHER_CORNER)),
+    "single_lift_cloth_3": SyntheticScene(_cloth("scarf"), 156, lift(GRIPPED_CORNER)),
+    "single_lift_cloth_4": SyntheticScene(_cloth("sheet"), 172, lift(GRIPPED_CORNER)),
+    "weird_package": SyntheticScene(_package, 39, lift((1.0, 0.5, 1.0), reach=0.028, offsets=LOW_LIFT)),
+    "double_lift_sloth": SyntheticScene(bodies.sloth, 62, lift((0.95, 0.0, 0.1), (0.95, 1.0, 0.1), reach=0.025)),
+    "double_stretch_sloth": SyntheticScene(bodies.sloth, 192, stretch((0.9, 1.0, 0.2), (0.0, 0.1, 0.2), 0.05)),
+    "single_lift_sloth": SyntheticScene(bodies.sloth, 85, lift((0.95, 1.0, 0.1), reach=0.025)),
+    "single_push_sloth": SyntheticScene(bodies.sloth, 68, push((0.4, 0.1, 0.5), (0, 1, 0), 0.1)),
+    "double_lift_zebra": SyntheticScene(bodies.zebra, 58, lift((0.85, 0.5, 1.0), (0.15, 0.5, 0.75), reach=0.025, offsets=TOGETHER)),
+    "double_stretch_zebra": SyntheticScene(bodies.zebra, 198, stretch((0.95, 0.5, 0.8), (0.1, 0.5, 0.6), 0.04)),
+    "single_lift_zebra": SyntheticScene(bodies.zebra, 66, lift((0.4, 0.5, 1.0), reach=0.028)),
+    "single_lift_dinosor": SyntheticScene(bodies.dinosaur, 86, lift((0.0, 0.5, 0.1), reach=0.03, offsets=LOW_LIFT)),
+    "rope_double_hand": SyntheticScene(_rope("twine"), 264, lift((0.02, 0.5, 0.5), (0.98, 0.5, 0.5), reach=0.016), marked=True),
+    "single_lift_rope": SyntheticScene(_rope("cord"), 50, lift((0.03, 0.5, 0.5), reach=0.016)),
+    "single_push_rope": SyntheticScene(_rope("twine"), 58, push((0.5, 0.0, 0.5), (0, 1, 0), 0.1)),
+    "single_push_rope_1": SyntheticScene(_rope("twine"), 92, push((0.25, 0.0, 0.5), (0.3, 1, 0), 0.12)),
+    "single_push_rope_4": SyntheticScene(_rope("cord"), 83, push((0.7, 0.0, 0.5), (-0.2, 1, 0), 0.1)),
 }

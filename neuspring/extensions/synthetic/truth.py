@@ -20,6 +20,7 @@ from neuspring.core.records import digest_file
 from neuspring.data.camera import Camera
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.extensions.synthetic.kernels import first_hit, nearest
+from neuspring.scenes.rays import on_cpu
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,17 +103,17 @@ def under_pixels(truth: Truth, camera: Camera, pixels: np.ndarray) -> MaterialPo
     origin = camera.camera_to_world[:3, 3]
     rays = camera.lift(np.asarray(pixels, dtype=float), np.ones(len(pixels))) - origin
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return _ask(truth, first_hit, len(rays), wp.vec3(*origin), wp.array(rays, dtype=wp.vec3, device="cpu"))
+    return _ask(truth, first_hit, len(rays), wp.vec3(*origin), on_cpu(rays, wp.vec3))
 
 
 def at_points(truth: Truth, points: np.ndarray) -> MaterialPoints:
     """The material nearest to `points` [Q, 3], m, in frame 0."""
-    return _ask(truth, nearest, len(points), wp.array(points, dtype=wp.vec3, device="cpu"))
+    return _ask(truth, nearest, len(points), on_cpu(points, wp.vec3))
 
 
 def _ask(truth: Truth, kernel: wp.Kernel, count: int, *where: object) -> MaterialPoints:
-    indices: wp.array = wp.array(truth.surface_faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-    mesh = wp.Mesh(wp.array(truth.surface(0), dtype=wp.vec3, device="cpu"), indices)
+    indices = on_cpu(truth.surface_faces.astype(np.int32).ravel(), wp.int32)
+    mesh = wp.Mesh(on_cpu(truth.surface(0), wp.vec3), indices)
     face: wp.array = wp.empty(count, dtype=wp.int32, device="cpu")
     weights: wp.array = wp.zeros(count, dtype=wp.vec3, device="cpu")
     wp.launch(kernel, count, [mesh.id, *where, FARTHEST_TRUTH, face, weights], device="cpu")

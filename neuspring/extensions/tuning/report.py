@@ -5,7 +5,6 @@ Everything is made from the sweep's storage, of a sweep that is finished or not.
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from neuspring.config import Config
 from neuspring.config.tuning import Tune
 from neuspring.core.files import write_text
 from neuspring.core.table import Table
-from neuspring.extensions.tuning.space import Plan
+from neuspring.extensions.tuning.space import Plan, section_of
 from neuspring.extensions.tuning.worker import FINISHED_STATES, study_of
 
 
@@ -64,8 +63,8 @@ def write_best(plan: Plan, best: FrozenTrial, folder: Path) -> None:
     description = f"{method}, tuned: trial {best.number} of sweep {plan.tune.study}"
     sections: dict[str, Any] = {}
     for path, value in best.params.items():
-        *above, key = path.split(".")
-        functools.reduce(lambda inside, part: inside.setdefault(part, {}), above, sections)[key] = value
+        above, key = section_of(sections, path)
+        above[key] = value
     fit, search = sections.pop("fit", {}), sections.pop("search", {})
     clusters = sections.pop("clusters", plan.row.clusters)
     tuned = config.plain(plan.method) | {"description": description, "search": name}

@@ -64,8 +64,7 @@ class Plan:
         """The settings (`SECTIONS` of a configuration) and number of regions of a trial. Raises InputError."""
         changed = copy.deepcopy(self.base)
         for name, value in values.items():
-            *path, key = name.split(".")
-            section = functools.reduce(lambda inside, part: inside.setdefault(part, {}), path, changed)
+            section, key = section_of(changed, name)
             if not isinstance(section, dict) or isinstance(section.get(key), dict):
                 raise InputError(where, "one setting is required, not a section or a part of a setting")
             section[key] = value
@@ -105,6 +104,12 @@ class Plan:
         for rule, broken in faults.items():
             if broken:
                 raise InputError(f"tune.space, {name}", rule)
+
+
+def section_of(sections: dict[str, Any], name: str) -> tuple[Any, str]:
+    """The section of a dotted name, which is made where there is none, and the name of the setting in it."""
+    *path, key = name.split(".")
+    return functools.reduce(lambda inside, part: inside.setdefault(part, {}), path, sections), key
 
 
 def contains(dimension: Dimension, value: Any) -> bool:

@@ -12,7 +12,7 @@ from neuspring.core.records import StageRecord
 from neuspring.core.run_record import RunRecord
 from neuspring.draw.benchmark import curves_figure
 from neuspring.draw.run import history_lines
-from neuspring.report.blocks import Block, Fold, PageSection
+from neuspring.report.blocks import Block, Fold
 from neuspring.report.data import ReportData, ReportSection, shown_figure
 from neuspring.scores.metrics import METRICS, bound_track_errors, track_errors
 
@@ -27,8 +27,8 @@ PLOTS = {
 MOST_CURVES = 12
 
 
-def curves(material: ReportData) -> PageSection | None:
-    """Curves of the shown methods; None where no run has left any."""
+def curves(material: ReportData) -> list[Block]:
+    """Curves of the shown methods; none where no run has left any."""
     scenarios = [name for name in material.choice.scenarios if material.first_runs(name)]
     seen = {name: material.observations(name) for name in scenarios[:MOST_CURVES]}
     facts = {name: observed.scenario if observed else None for name, observed in seen.items()}
@@ -38,7 +38,7 @@ def curves(material: ReportData) -> PageSection | None:
         if panels := {name: own for name, own in panels.items() if own}:
             figure = curves_figure(panels, facts if what in CURVE_ERRORS else None)
             blocks.append(Fold(summary=title, blocks=[shown_figure(figure, title)], open=not blocks))
-    return PageSection(key="curves", title="Curves", blocks=blocks) if blocks else None
+    return blocks
 
 
 def _lines(material: ReportData, scenario: str, what: str, observed: Observations | None) -> dict[str, pd.Series]:
@@ -79,4 +79,4 @@ def _error(material: ReportData, run: RunRecord, metric: str, observed: Observat
     return material.read(record, read)
 
 
-section = ReportSection(order=90, make=curves)
+section = ReportSection(order=90, title="Curves", make=curves)

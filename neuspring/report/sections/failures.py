@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from neuspring.core.table import Cell, Table
 from neuspring.core.text import duration
-from neuspring.report.blocks import Block, PageSection, Text
+from neuspring.report.blocks import Block, Text
 from neuspring.report.data import MOST_ROWS, ReportData, ReportSection, link
 from neuspring.report.tables import failure_blocks
 
 
-def failures(material: ReportData) -> PageSection:
+def failures(material: ReportData) -> list[Block]:
     """Everything that keeps runs out of the tables."""
     blocks: list[Block] = []
     if failed := [job for job in material.jobs if job.failed]:
@@ -30,7 +30,7 @@ def failures(material: ReportData) -> PageSection:
         note = "Delete a damaged file and run the same command again."
         blocks.append(Table(caption="Damaged files", header=["File", "Why"], rows=damaged, note=note))
     blocks += failure_blocks(material.numbers)
-    return PageSection(key="failures", title="Failures", blocks=blocks or [Text(text="Nothing has failed.", tone="good")])
+    return blocks or [Text(text="Nothing has failed.", tone="good")]
 
 
-section = ReportSection(order=70, make=failures, phase=2)
+section = ReportSection(order=70, title="Failures", make=failures, phase=2)

@@ -13,7 +13,7 @@ from PIL import Image
 from neuspring.core.run_record import RunRecord
 from neuspring.core.text import program
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
-from neuspring.report.blocks import Block, Code, Fold, Grid, PageSection, Picture
+from neuspring.report.blocks import Block, Code, Fold, Grid, Picture
 from neuspring.report.data import NO_ROOM, PERCEPTION, ReportData, ReportSection, data_uri, link, webp
 from neuspring.report.tables import several
 
@@ -21,7 +21,7 @@ MOST_OPEN = 3
 """Scenarios that are not folded."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Kind:
     """A picture or film that runs have, in the order in which they are embedded."""
 
@@ -37,16 +37,16 @@ class Kind:
 
 
 KINDS = (
-    Kind(artifact="images", stem="video", title="Film: observed, predicted", least=9),
-    Kind(artifact="images", stem="images", title="Frames: observed, predicted, difference", width=1100),
-    Kind(artifact="images", stem="turntable", title="Film: the twin from all around", least=13),
-    Kind(artifact="plots", stem="motion", title="Motion: predicted nodes and observed points", width=1200, paper=True),
-    Kind(artifact="plots", stem="stiffness", title="Stiffness of the springs", width=900, paper=True, least=27),
-    Kind(artifact="plots", stem="topology", title="Regions and springs", width=900, paper=True, least=27),
-    Kind(artifact="images", stem="appearance", title="Splats of frame 0", width=900),
-    Kind(artifact=PERCEPTION, stem="masks", title="Perceived: masks", width=900),
-    Kind(artifact=PERCEPTION, stem="tracks", title="Perceived: tracks", width=900),
-    Kind(artifact=PERCEPTION, stem="lifted", title="Perceived: points in space", width=900, paper=True),
+    Kind("images", "video", "Film: observed, predicted", least=9),
+    Kind("images", "images", "Frames: observed, predicted, difference", width=1100),
+    Kind("images", "turntable", "Film: the twin from all around", least=13),
+    Kind("plots", "motion", "Motion: predicted nodes and observed points", width=1200, paper=True),
+    Kind("plots", "stiffness", "Stiffness of the springs", width=900, paper=True, least=27),
+    Kind("plots", "topology", "Regions and springs", width=900, paper=True, least=27),
+    Kind("images", "appearance", "Splats of frame 0", width=900),
+    Kind(PERCEPTION, "masks", "Perceived: masks", width=900),
+    Kind(PERCEPTION, "tracks", "Perceived: tracks", width=900),
+    Kind(PERCEPTION, "lifted", "Perceived: points in space", width=900, paper=True),
 )
 
 
@@ -64,8 +64,8 @@ def embedded(material: ReportData, path: Path, kind: Kind) -> Picture:
     return Picture(caption="", film=True, data=data_uri("video/mp4", path.read_bytes()), head=head)
 
 
-def pictures(material: ReportData) -> PageSection | None:
-    """A fold per scenario: its films in step, and its pictures; None without any."""
+def pictures(material: ReportData) -> list[Block]:
+    """A fold per scenario: its films in step, and its pictures; none without any."""
     folds = list[Block]()
     for scenario in material.choice.scenarios:
         runs = material.first_runs(scenario)
@@ -75,13 +75,9 @@ def pictures(material: ReportData) -> PageSection | None:
             more: list[Block] = [Fold(summary=title, blocks=[grid]) for title, grid in grids[1:]]
             others = [Fold(summary="More pictures", blocks=more)] if more else []
             summary = f"{scenario}: {several(len(runs), 'method')}, seed {seeds}"
-            blocks: list[Block] = [grids[0][1], *others, Code(text=command, whole=True)]
+            blocks: list[Block] = [grids[0][1], *others, Code(text=command)]
             folds.append(Fold(summary=summary, blocks=blocks, open=len(folds) < MOST_OPEN))
-    about = (
-        "All methods in step, one seed of every scenario; under the slider training is blue and the future orange. The command "
-        "opens the twins in the browser, to be turned and pulled."
-    )
-    return PageSection(key="pictures", title="Film", about=about, blocks=folds) if folds else None
+    return folds
 
 
 def _grids(material: ReportData, scenario: str, runs: dict[str, RunRecord]) -> Iterator[tuple[str, Grid]]:
@@ -107,4 +103,11 @@ def _grids(material: ReportData, scenario: str, runs: dict[str, RunRecord]) -> I
             yield kind.title, Grid(blocks=figures, least=kind.least, films=film, training=training * film)
 
 
-section = ReportSection(order=30, make=pictures, phase=1)
+section = ReportSection(
+    order=30,
+    title="Film",
+    make=pictures,
+    about="All methods in step, one seed of every scenario; under the slider training is blue and the future orange. The command "
+    "opens the twins in the browser, to be turned and pulled.",
+    phase=1,
+)

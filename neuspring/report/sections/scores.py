@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from neuspring.report.blocks import Block, PageSection, Text
+from neuspring.report.blocks import Block, Text
 from neuspring.report.data import ReportData, ReportSection, shown_figure
 from neuspring.report.tables import ratios_drawn, summary_blocks
 
 
-def scores(material: ReportData) -> PageSection:
+def scores(material: ReportData) -> list[Block]:
     """Averages, breakdowns, ratios, aims."""
     if not len(material.table.finished):
-        return PageSection(key="scores", title="Scores", blocks=[Text(text="No run has finished.", tone="mute")])
+        return [Text(text="No run has finished.", tone="mute")]
     blocks: list[Block] = summary_blocks(material.numbers)
     if drawn := ratios_drawn(material.numbers):
         blocks.append(shown_figure(drawn[1], drawn[0]))
-    return PageSection(key="scores", title="Scores", blocks=blocks)
+    return blocks
 
 
-section = ReportSection(order=40, make=scores)
+section = ReportSection(order=40, title="Scores", make=scores)

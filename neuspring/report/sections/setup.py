@@ -12,7 +12,7 @@ from neuspring.config import Config
 from neuspring.core.run_record import flat
 from neuspring.core.table import Cell, Table
 from neuspring.core.text import program
-from neuspring.report.blocks import Block, Code, PageSection, Text
+from neuspring.report.blocks import Block, Code, Text
 from neuspring.report.data import ReportData, ReportSection, link
 from neuspring.report.tables import settings_table, several
 
@@ -32,7 +32,7 @@ WHAT = ("scenarios", "methods", "seeds", "results", "tables")
 """Keys that say what the benchmark is, not how it runs."""
 
 
-def setup(material: ReportData) -> PageSection:
+def setup(material: ReportData) -> list[Block]:
     """Commits, configuration, versions, machines, files."""
     runs, settings = material.runs, material.choice.settings
     commits = Counter(run.commit or "unknown" for run in runs)
@@ -57,8 +57,8 @@ def setup(material: ReportData) -> PageSection:
     links = [[Cell(text=material.relative(path), link=link(path, here.parent))] for path in files]
     blocks += [Table(caption="Files of the tables", header=["File"], rows=links)] if links else []
     command = shlex.join([program("neuspring"), "ui", "--results", str(material.results)])
-    blocks += [Text(text="All runs in MLflow:"), Code(text=command, whole=True)]
-    return PageSection(key="setup", title="Settings and versions", blocks=blocks)
+    blocks += [Text(text="All runs in MLflow:"), Code(text=command)]
+    return blocks
 
 
-section = ReportSection(order=50, make=setup)
+section = ReportSection(order=50, title="Settings and versions", make=setup)

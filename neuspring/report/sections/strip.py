@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from neuspring.draw.sheet import TIME_BAR, TITLE_LINE
-from neuspring.report.blocks import Block, Fold, Grid, PageSection, Picture, Text
+from neuspring.report.blocks import Block, Fold, Grid, Picture, Text
 from neuspring.report.data import NO_ROOM, ReportData, ReportSection, webp
 from neuspring.report.sections.pictures import MOST_OPEN
 from neuspring.report.tables import several
@@ -45,8 +45,8 @@ def around(panels: np.ndarray) -> tuple[slice, slice]:
     return slice(top, bottom), slice(left, right)
 
 
-def strip(material: ReportData) -> PageSection | None:
-    """A row of pictures per scenario; None where no run has a film."""
+def strip(material: ReportData) -> list[Block]:
+    """A row of pictures per scenario; none where no run has a film."""
     rows: list[Block] = []
     for scenario in material.choice.scenarios:
         films = {name: material.file(run, "images", "video") for name, run in material.first_runs(scenario).items()}
@@ -73,8 +73,13 @@ def strip(material: ReportData) -> PageSection | None:
         rows.append(Grid(blocks=figures, least=10) if fits else Text(text=f"{scenario}: {NO_ROOM}.", tone="mute"))
     rest = rows[MOST_OPEN:]
     more = [Fold(summary=f"{several(len(rest), 'scenario')} more", blocks=rest)] if rest else []
-    about = "What was filmed and what each method predicts, in the last frame of the future, first camera, cut out; one seed."
-    return PageSection(key="strip", title="Last frame", about=about, blocks=[*rows[:MOST_OPEN], *more]) if rows else None
+    return [*rows[:MOST_OPEN], *more]
 
 
-section = ReportSection(order=15, make=strip, phase=1)
+section = ReportSection(
+    order=15,
+    title="Last frame",
+    make=strip,
+    about="What was filmed and what each method predicts, in the last frame of the future, first camera, cut out; one seed.",
+    phase=1,
+)

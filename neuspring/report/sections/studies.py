@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from neuspring.report.blocks import Block, Fold, PageSection
+from neuspring.report.blocks import Block, Fold
 from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.study import blocks_of
 
 
-def studies(material: ReportData) -> PageSection | None:
-    """A fold per study that was asked for, or of which several methods ran on the paper's data; None without any."""
+def studies(material: ReportData) -> list[Block]:
+    """A fold per study that was asked for, or of which several methods ran on the paper's data; none without any."""
     choice, runs = material.choice, material.table.runs
     of_paper = set(runs.loc[(runs["status"] == "ok") & (runs["source"] == "phystwin"), "method"])
     asked = choice.settings.studies if choice.settings else ()
-    folds: list[Block] = [
+    return [
         Fold(summary=f"{name}: {study.title}", blocks=blocks_of(name, study, material.table, material.results))
         for name, study in choice.studies.items()
         if len(runs) and (name in asked or len(of_paper & set(study.rows.values())) > 1)
     ]
-    return PageSection(key="studies", title="The paper's tables", blocks=folds) if folds else None
 
 
-section = ReportSection(order=45, make=studies)
+section = ReportSection(order=45, title="The paper's tables", make=studies)

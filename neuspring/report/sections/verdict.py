@@ -6,23 +6,23 @@ import shlex
 
 from neuspring.core.job_records import asked
 from neuspring.report import tables
-from neuspring.report.blocks import Block, Code, PageSection, Text
+from neuspring.report.blocks import Block, Code, Text
 from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.tables import several
 
 
-def verdict(material: ReportData) -> PageSection:
+def verdict(material: ReportData) -> list[Block]:
     """The verdict, and how many jobs failed and files cannot be read."""
     text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
     blocks: list[Block] = tables.verdict(material.numbers) if len(material.table.runs) else [Text(text=text, tone="warn")]
     command = asked(material.results).get("command")
     if command and (material.table.runs["status"] != "ok").any():
-        blocks += [Text(text="Finish what is missing; finished runs are kept:"), Code(text=shlex.join(command), whole=True)]
+        blocks += [Text(text="Finish what is missing; finished runs are kept:"), Code(text=shlex.join(command))]
     failed = sum(job.failed for job in material.jobs)
     for count, noun, what in ((failed, "job", "failed"), (len(material.damaged), "file", "cannot be read")):
         if count:
             blocks.append(Text(text=f"{several(count, noun)} {what}: see Failures.", tone="warn"))
-    return PageSection(key="verdict", title="Verdict", blocks=blocks)
+    return blocks
 
 
-section = ReportSection(order=10, make=verdict, phase=2)
+section = ReportSection(order=10, title="Verdict", make=verdict, phase=2)

@@ -7,13 +7,13 @@ import numpy as np
 from neuspring.core.job_records import JobRecord
 from neuspring.core.table import Table
 from neuspring.core.text import duration
-from neuspring.report.blocks import PageSection
+from neuspring.report.blocks import Block
 from neuspring.report.data import ReportData, ReportSection
 from neuspring.report.tables import cost_table
 
 
-def work(material: ReportData) -> PageSection | None:
-    """Jobs by rule, stages by method; None where neither is recorded."""
+def work(material: ReportData) -> list[Block]:
+    """Jobs by rule, stages by method; none where neither is recorded."""
     by_rule: dict[str, list[JobRecord]] = {}
     for job in material.jobs:
         by_rule.setdefault(job.rule, []).append(job)
@@ -24,9 +24,8 @@ def work(material: ReportData) -> PageSection | None:
         times = [duration(float(value)) for value in (np.median(seconds or [0]), max(seconds, default=0), sum(seconds))]
         rows.append([rule, len(jobs), sum(job.failed for job in jobs), *times, f"{peak:.0f} MB"])
     header = ["Rule", "Jobs", "Failed", "Median", "Longest", "Sum", "Peak memory"]
-    blocks = [Table.of_texts(header, rows, "Jobs")] if material.jobs else []
-    blocks += [cost_table(material.numbers)] if len(material.table.task("time")) else []
-    return PageSection(key="work", title="Time and hardware", blocks=blocks) if blocks else None
+    jobs_table = [Table.of_texts(header, rows, "Jobs")] if material.jobs else []
+    return [*jobs_table, *([cost_table(material.numbers)] if len(material.table.task("time")) else [])]
 
 
-section = ReportSection(order=80, make=work)
+section = ReportSection(order=80, title="Time and hardware", make=work)

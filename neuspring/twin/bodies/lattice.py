@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,9 +106,7 @@ and it goes on for the rest of dt.
         stability.check(twin)
 
     def stable(self, twin: Twin, safety: float) -> Twin:
-        simulation = twin.simulation
-        count = stability.smallest_safe_substeps(stability.twin_spectrum(twin), simulation.frame_time, safety)
-        return replace(twin, simulation=replace(simulation, substeps=max(count, simulation.substeps)))
+        return stability.stable(twin, safety)
 
     def for_prediction(self, twin: Twin) -> Twin:
         return stability.for_prediction(twin)

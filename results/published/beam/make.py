@@ -39,7 +39,7 @@ from neuspring.core.errors import InputError
 from neuspring.core.table import Cell, Table
 from neuspring.data.c3d import Markers
 from neuspring.extensions.rods.rod import Rod
-from neuspring.extensions.rods.solver import RodLanes, RodSolver
+from neuspring.extensions.rods.solver import RodSolver
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import build, object_springs
 from neuspring.twin.body import body_of
@@ -284,7 +284,7 @@ class RodBeam(Beam):
     def _solver(self, modulus: float, load: float, simulation: Simulation) -> tuple[RodSolver, torch.Tensor]:
         rod = self._rod(modulus, load)
         x = torch.tensor(rod.vertices)[None]
-        solver = RodSolver(RodLanes.of([rod], [0.0]), simulation)
+        solver = RodSolver([rod], [0.0], simulation)
         solver.start(x, torch.zeros_like(x))
         return solver, x
 

@@ -107,18 +107,16 @@ def real(values: Any) -> torch.Tensor:
 
 def stored(solver: RodSolver) -> float:
     """Energy, J, of the joints, branches and edges of one rod in the state of its solver."""
-    lanes, state = (
-        solver.lanes,
-        {name: wp.to_torch(getattr(solver._state, name))[0].numpy() for name in ("k", "theta", "reference", "z")},
-    )
-    stretch = np.linalg.norm(np.diff(solver.x[0].numpy(), axis=0), axis=1) / lanes.lengths[0] - 1
-    joint = np.convolve(lanes.lengths[0], [0.5, 0.5])[1:-1]
+    (rod,) = solver.rods
+    state = {name: wp.to_torch(getattr(solver._state, name))[0].numpy() for name in ("k", "theta", "reference", "z")}
+    stretch = np.linalg.norm(np.diff(solver.x[0].numpy(), axis=0), axis=1) / rod.lengths - 1
+    joint = np.convolve(rod.lengths, [0.5, 0.5])[1:-1]
     twist = np.diff(state["theta"][:-1]) + state["reference"][1:-1]
-    k, ei, gj = state["k"][1:-1], lanes.bending[0, 1:-1] / joint, lanes.twisting[0, 1:-1] / joint
-    energy = (ei * ((k - lanes.curvature[0, 1:-1]) ** 2).sum(axis=1) + gj * twist**2).sum() / 2
-    energy += (lanes.stretching[0] * stretch**2 * lanes.lengths[0]).sum() / 2
-    for branch, (share, _) in enumerate(lanes.slip[0]):
+    k, ei, gj = state["k"][1:-1], rod.bending[1:-1] / joint, rod.twisting[1:-1] / joint
+    energy = (ei * ((k - rod.curvature[1:-1]) ** 2).sum(axis=1) + gj * twist**2).sum() / 2
+    energy += (rod.stretching * stretch**2 * rod.lengths).sum() / 2
+    for branch, (share, _) in enumerate(rod.slip):
         away = np.column_stack([k, twist]) - state["z"][1:-1, branch]
-        twists = gj * away[:, 2] ** 2 if lanes.slip_twist[0] else 0.0
+        twists = gj * away[:, 2] ** 2 if rod.slip_twist else 0.0
         energy += share * (ei * (away[:, :2] ** 2).sum(axis=1) + twists).sum() / 2
     return float(energy)

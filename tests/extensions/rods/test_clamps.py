@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from neuspring.extensions.rods.nodes import Clamps, hanging
 from neuspring.extensions.rods.rod import Rod
-from neuspring.extensions.rods.solver import RodLanes, RodSolver
+from neuspring.extensions.rods.solver import RodSolver
 from tests.extensions.rods import make
 
 
@@ -20,7 +20,7 @@ def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **ch
     """Vertices [F, V, 3] and m1 [F, E, 3] behind each frame of a hand with rotations [F + 1] and positions [F + 1, 3]."""
     hands = np.stack([turns.apply(jaw) for jaw in make.JAWS], axis=1) + shifts[:, None]
     paths, axes = Clamps.of([rod]).paths(make.real(hands)[:, None])
-    solver = RodSolver(RodLanes.of([rod], [drag]), make.simulation(**changes))
+    solver = RodSolver([rod], [drag], make.simulation(**changes))
     solver.start(make.real(turns[0].apply(np.array(rod.vertices)) + shifts[0])[None], torch.zeros(1, len(rod.mass), 3), axes[0])
     x, m1 = solver.frames(paths, axes)
     return x[:, 0].numpy().copy(), m1[:, 0].numpy().copy()
@@ -70,9 +70,8 @@ def test_a_rod_at_rest_stays_and_lanes_do_not_mix() -> None:
     rods = [make.clamped(9, bending=each, curvature=np.full((9, 2), 0.05)) for each in (0.01, 0.05)]
     x, m1, axes = hanging(rods, np.stack([make.JAWS, make.JAWS + 1.0]), make.simulation(gravity=9.8))
     np.testing.assert_allclose(hanging(rods[1:], make.JAWS[None] + 1.0, make.simulation(gravity=9.8))[0][0], x[1], atol=1e-12)
-    solver = RodSolver(
-        RodLanes.of([replace(rod, vertices=own) for rod, own in zip(rods, x, strict=True)], [0, 0]), make.simulation(gravity=9.8)
-    )
+    moved = [replace(rod, vertices=own) for rod, own in zip(rods, x, strict=True)]
+    solver = RodSolver(moved, [0, 0], make.simulation(gravity=9.8))
     solver.start(make.real(x), torch.zeros(2, 9, 3), make.real(axes))
     np.testing.assert_array_equal(solver.directors().numpy(), m1)
     later, _ = solver.frames(solver.x.expand(51, -1, -1, -1))

@@ -9,7 +9,7 @@ import pytest
 
 from neuspring.cli.main import main
 from neuspring.config import parse
-from neuspring.extensions.rods.clips import TAGS, ClipNumbers, clip_blocks, published
+from neuspring.extensions.rods.clips import TAGS, ClipNumbers, published
 from neuspring.report.blocks import markdown
 from neuspring.scores.metrics import SCORE_COLUMNS
 from neuspring.scores.paper import Study, read_studies
@@ -47,7 +47,7 @@ def test_published_numbers_keep_their_digits_their_sources_and_what_the_tag_mean
 def test_ours_stand_beside_published_numbers_with_clips_seeds_and_time(tmp_path):
     for seed, factor in ((0, 1.0), (1, 1.5)):
         write_transfer(tmp_path, "DLO3", "rod", seed, {clip: factor * value for clip, value in CLIPS.items()})
-    tables = tables_in(clip_blocks(found(tmp_path)))
+    tables = tables_in(found(tmp_path).blocks())
     overview = rows_of(tables["L1 per cable"])
     # Seeds have 4 and 6 mm.
     assert overview["Rod"]["DLO3"].text == "5.00 ± 1.41" and overview["Rod"]["DLO3"].mark == "best"
@@ -75,7 +75,7 @@ def test_a_mean_of_fewer_clips_is_marked_and_never_the_best(tmp_path):
     write_transfer(tmp_path, "DLO3", "rod", 0, CLIPS)
     fewer = dict.fromkeys(list(CLIPS)[:2], 0.001)
     write_transfer(tmp_path, "DLO3", "rod_free", 0, fewer, diverged=("DLO3_eval_c",))
-    blocks = clip_blocks(found(tmp_path))
+    blocks = found(tmp_path).blocks()
     overview = rows_of(tables_in(blocks)["L1 per cable"])
     assert overview["Residual"]["DLO3"].text == "1.00 *" and overview["Residual"]["DLO3"].mark == ""
     assert overview["Rod"]["DLO3"].mark == "best"

@@ -13,7 +13,7 @@ import warp as wp
 from scipy.integrate import solve_bvp
 
 from neuspring.extensions.rods.rod import Rod
-from neuspring.extensions.rods.solver import RodLanes, RodSolver
+from neuspring.extensions.rods.solver import RodSolver
 from tests.extensions.rods import make
 
 NONE = np.zeros((0, 2))
@@ -23,7 +23,7 @@ LIVELY = {"curvature": np.random.default_rng(1).normal(0, 0.3, (7, 2)), "roll": 
 
 def started(rods: list[Rod], v: Any = 0.0, **changes: Any) -> RodSolver:
     """A solver at frame 0."""
-    solver = RodSolver(RodLanes.of(rods, [0.0] * len(rods)), make.simulation(**({"substeps": 1} | changes)))
+    solver = RodSolver(rods, [0.0] * len(rods), make.simulation(**({"substeps": 1} | changes)))
     x = make.real([body.vertices for body in rods])
     solver.start(x, torch.zeros_like(x) + v)
     return solver

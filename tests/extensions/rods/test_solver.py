@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neuspring.extensions.rods.rod import Rod
-from neuspring.extensions.rods.solver import RodLanes, RodSolver
+from neuspring.extensions.rods.solver import RodSolver
 from tests.extensions.rods import make
 
 # Sums of some hundred numbers in float64, through a few hundred substeps.
@@ -21,7 +21,7 @@ LIVELY = {"curvature": np.random.default_rng(1).normal(0, 0.3, (7, 2)), "roll": 
 
 def solver_of(rods: list[Rod], v: Any = 0.0, drag: float = 0.0, **changes: Any) -> RodSolver:
     """A solver at frame 0: `v` is one velocity, or that of each vertex."""
-    solver = RodSolver(RodLanes.of(rods, [drag] * len(rods)), make.simulation(**changes), "cpu")
+    solver = RodSolver(rods, [drag] * len(rods), make.simulation(**changes), "cpu")
     x = make.real([body.vertices for body in rods])
     solver.start(x, torch.zeros_like(x) + v)
     return solver

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 VIDEO_ENDINGS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
 TONE_MAP = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip,zscale=t=bt709:m=bt709:r=tv,format=yuv420p"
-SQUARE = "scale=WIDTH:HEIGHT,setsar=1"
+SQUARE_PIXELS = "scale=WIDTH:HEIGHT,setsar=1"
 """ffmpeg applies marks by itself; WIDTH and HEIGHT are those of the intrinsics."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
@@ -67,8 +67,8 @@ class VideoFile:
         ratio, matrix = stream.sample_aspect_ratio, [one for one in frame.side_data if "DISPLAYMATRIX" in str(one)]
         codec = stream.codec_context
         for received, wrong, filters in (
-            ("a mark by which players turn or flip it", matrix, SQUARE),
-            (f"pixels of {ratio}", ratio not in (None, 0, 1), SQUARE),
+            ("a mark by which players turn or flip it", matrix, SQUARE_PIXELS),
+            (f"pixels of {ratio}", ratio not in (None, 0, 1), SQUARE_PIXELS),
             ("interlaced", frame.interlaced_frame, "bwdif=mode=send_frame"),
             ("HDR (PQ or HLG)", codec.color_trc in (16, 18), TONE_MAP),
             ("colors of BT.2020", codec.color_primaries == 9, "zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"),

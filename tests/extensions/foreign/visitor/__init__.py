@@ -13,7 +13,7 @@ from neuspring.baselines import Baseline
 from neuspring.extensions.exports import Export
 from neuspring.extensions.make_capture.formats import CaptureFormat
 from neuspring.extensions.make_capture.streams import Series
-from neuspring.report.blocks import PageSection, Text
+from neuspring.report.blocks import Text
 from neuspring.report.data import ReportSection
 
 
@@ -63,5 +63,4 @@ class Stack:
 LAG = Baseline(prediction="visitor:lag")
 STACK = CaptureFormat(about="a .npz file with {kind}", recognizes=lambda path: path.suffix == ".npz", pictures=Stack)
 XYZ = Export(write=write_xyz, frames="0")
-_PAGE = PageSection(key="visit", title="A visit", blocks=[Text(text="A visitor was here.")])
-VISIT = ReportSection(order=99, make=lambda material: _PAGE)
+VISIT = ReportSection(order=99, title="A visit", make=lambda material: [Text(text="A visitor was here.")])
