@@ -114,7 +114,7 @@ def test_a_network_moves_to_another_recording(seen, tmp_path):
 
 def test_a_training_that_breaks_is_a_failure_whose_run_is_held_and_counted(seen, monkeypatch):
     stiff = SpringGausTraining(supervision="points", anchors=60, iterations=2, stiffness=1e12, substeps=1, max_substeps=2)
-    monkeypatch.setattr(SpringGausTraining, "of", lambda settings: stiff)
+    monkeypatch.setattr("neuspring.extensions.spring_gaus.train.SpringGausTraining", lambda **settings: stiff)
     run = run_all(seen, "spring_gaus", settings())
     record = json.loads(run.read_text())
     trained = StageRecord.load(run.with_name("train.json"))
@@ -142,7 +142,7 @@ def test_splats_that_failed_and_too_few_anchors_are_failures_that_are_counted(se
     found = StageRecord.load(out)
     assert (found.status, found.files) == ("failed", {}) and "removed the last splat" in found.reason
     lonely = SpringGausTraining(supervision="points", anchors=60, iterations=2, neighbors=500)
-    monkeypatch.setattr(SpringGausTraining, "of", lambda settings: lonely)
+    monkeypatch.setattr("neuspring.extensions.spring_gaus.train.SpringGausTraining", lambda **settings: lonely)
     run = run_all(seen, "spring_gaus", settings())
     record = json.loads(run.read_text())
     assert record["status"] == "failed" and "more anchors than neighbors (500) are required" in record["reason"]
