@@ -251,8 +251,11 @@ def unlike(watched: Mapping[str, Watched]) -> Iterator[dict[str, Any]]:
     """
     for name, one in watched.items():
         # Cameras of one capture agree in time.
-        shifts = {other: measure(seen.color, one.masks, None if other == name else 2) for other, seen in watched.items()}
-        fits = {other: shift.agreement for other, shift in shifts.items() if shift}
+        fits = {
+            other: shift.agreement
+            for other, seen in watched.items()
+            if (shift := measure(seen.color, one.masks, None if other == name else 2))
+        }
         best = max(fits, key=fits.__getitem__, default=name)
         if name in fits:
             told = {"where": f"camera {name}", "value": fits[name] / max(2 * AGREE, fits[best])}

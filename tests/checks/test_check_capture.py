@@ -172,6 +172,12 @@ def test_masks_that_show_something_else(capture, change, name, value):
     assert one.level == "warning" and value in (None, pytest.approx(one.value, rel=0.005))
 
 
+def test_an_object_that_frame_0_does_not_show_is_one_finding(capture):
+    labels = capture.mask("0", 0)
+    cv2.imwrite(str(capture.path("mask", "0", 0)), np.where(labels == OBJECT, 0, labels))
+    assert [one.name for one in check_layout(capture.folder) if one.level != "note"] == ["no object in frame 0"]
+
+
 def test_what_is_wrong_with_every_mask_is_reported_once(capture):
     for frame in range(capture.frame_count):
         cv2.imwrite(str(capture.path("mask", "0", frame)), np.repeat(capture.mask("0", frame)[..., None], 3, axis=2))

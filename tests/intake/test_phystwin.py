@@ -30,6 +30,15 @@ def test_a_conforming_case(tmp_path):
     assert observations.scenario.provenance == {name: f"sha256:{digest_file(folder / name)}" for name in files}
 
 
+def test_controllers_whose_order_changes_from_frame_to_frame_are_refused(tmp_path):
+    folder, rng = write_case(tmp_path), np.random.default_rng(0)
+    edit(folder, controller_points=np.stack([rng.permutation(row) for row in stored(folder)["controller_points"]]))
+    with pytest.raises(
+        InputError, match=r"final_data.pkl: controller_points: each point must keep its index.*in frames 1 to 9; steps"
+    ):
+        phystwin.read(ROW, folder)
+
+
 def test_optional_files(tmp_path):
     folder = write_case(tmp_path, surface=0, interior=0)
     for name in ("gt_track_3d.pkl", "metadata.json", "calibrate.pkl"):

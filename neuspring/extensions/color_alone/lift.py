@@ -115,8 +115,9 @@ def lift_color(
     hidden = pixels_of(first.filled & (labels[0] != OBJECT))[::HIDDEN_STRIDE].astype(np.float32)
     pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
     visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
-    # Nothing of the object is handed on from future frames, or of repeated images.
-    visible[[not capture.shows(name, frame) or frame >= capture.train_end for frame in range(frames)]] = False
+    # Nothing of the object is handed on from future frames, or of repeated images, of which marks are not scored either.
+    new = np.array([capture.shows(name, frame) for frame in range(frames)])
+    visible[~new] = visible[capture.train_end :] = False
     pixels = np.where(visible[..., None], pixels, 0.0)
     places = np.concatenate([tracks.pixels[0, own], hidden])
     points = np.zeros((frames, len(places), 3))
@@ -136,7 +137,7 @@ def lift_color(
         **silhouettes(labels[: capture.train_end]),
         cell=DISTANCE_CELL,
         **seen,
-        marked=capture.points(name),
+        marked=np.where(new[:, None, None], capture.points(name), np.nan),
     )
     if space.hands is None:
         hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]))
