@@ -27,11 +27,7 @@ LEAST, SLOW = 0.01, 0.5
 """m and m/s: smaller and slower steps may be noise."""
 HELD = 4
 """Frames from which a place that stays equal to the bit is looked at."""
-<<<<<<< ours
-EXCHANGED, MANY_EXCHANGES = 0.5, 0.1
-=======
 EXCHANGED, REORDERED = 0.5, 0.1
->>>>>>> theirs
 """Steps after an exchange of labels, as a part of those before it, that show that they were exchanged; and the part of the frames
 with an exchange from which points have no order."""
 ORDER = "Write each point at the same index in all frames, or leave the frames out."
@@ -186,11 +182,7 @@ def held(moving: Moving) -> dict[str, Any] | None:
 def swapped(moving: Moving) -> dict[str, Any] | None:
     """Points that exchange their places; an error where their order changes often."""
     words = told([(point, frame, f"in frame {frame}") for frame, group, *_ in moving.swapped for point in group])
-<<<<<<< ours
-    if words and len(moving.swapped) > max(MANY_EXCHANGES * len(moving.given), NAMED):
-=======
     if words and len(moving.swapped) > max(REORDERED * len(moving.given), NAMED):
->>>>>>> theirs
         _, _, given, best = zip(*moving.swapped, strict=True)
         times = f"steps {sum(given) / max(sum(best), LEAST):.2g} times those in the best order"
         words |= {"level": "error", "detail": f"in frames {spans(words['frames'])}; {times}"}

@@ -51,7 +51,7 @@ def show(what: RunFolder | Twin | Trajectory, observations: Observations | None,
     """`neuspring.api.show`."""
     if isinstance(what, RunFolder):
         observations = what.observations if observations is None else observations
-        subject: Twin | Trajectory | None = what.twin if what.trajectory is None else what.trajectory
+        subject = what.twin if what.trajectory is None else what.trajectory
     else:
         subject = what
     if subject is None:

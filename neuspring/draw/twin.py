@@ -40,7 +40,7 @@ def region_colors(count: int) -> np.ndarray:
     """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
     if count <= len(PALETTE):
         return to_rgba_array(PALETTE[:count])
-    return np.asarray(colormaps["turbo"](np.linspace(0.05, 0.85, count)))
+    return colormaps["turbo"](np.linspace(0.05, 0.85, count))
 
 
 def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
@@ -86,7 +86,7 @@ class TwinPicture:
         if quantity == "stiffness":
             return self._of_stiffness(body_of(twin).node_stiffness(twin))
         names, region = np.unique(twin.topology.labels, return_inverse=True)
-        return np.asarray(region_colors(len(names))[region])
+        return region_colors(len(names))[region]
 
     def spring_colors(self, take: ShownRun, quantity: Quantity) -> np.ndarray:
         """RGBA [S, 4] of object springs."""

@@ -132,7 +132,7 @@ class Buffers:
         ]
         self.width = 1 if threads else width_for(max(map(len, members)))
         self.table_of_group: list[int] = []
-        seats: list[int] = []
+        seats = []
         for table, twins in enumerate(members):
             groups = -(-len(twins) // self.width)
             self.table_of_group += [table] * groups
@@ -205,7 +205,7 @@ class Buffers:
 
     def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:
         """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else each group's data together."""
-        kind: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
+        kind = {"dtype": self.dtype, "device": self.device}
         if self.threads:
             return torch.zeros((*shape, self.groups, *entry), **kind)
         return torch.zeros((self.groups, *shape, *entry), **kind).movedim(0, len(shape))

@@ -38,7 +38,7 @@ def allocate(b: Buffers) -> None:
     if not b.simulation.self_collision:
         return
     twins = b.groups * b.width
-    device: dict[str, Any] = {"dtype": torch.int32, "device": b.device}
+    device = {"dtype": torch.int32, "device": b.device}
     b.set_table("overflow", (b.nodes, b.groups, b.width))
     if b.threads:
         # A thread is of one twin: lists of different lanes do not share.

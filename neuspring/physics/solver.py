@@ -350,11 +350,6 @@ class FrameWindow:
         """As `FrameSolver.overflows`."""
         return [sum(counts) for counts in zip(*(solver.overflows for solver in self._solvers), strict=True)]
 
-    @property
-    def collision_overflow(self) -> int:
-        """As `FrameSolver.collision_overflow`."""
-        return sum(self.overflows)
-
 
 class AdjointLimit:
     """Limit of one backward pass through chained frames: leaves out frames whose adjoints outgrow the losses, and counts them.

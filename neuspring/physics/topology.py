@@ -23,6 +23,14 @@ TREE_QUANTILE = 0.9
 """Quantile of the tree's edges that is the spacing."""
 
 
+def nearest(nodes: np.ndarray, points: np.ndarray, count: int, reach: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Distances, m, and indices [P, k] of the `count` nearest nodes of points [P, 3], or all; infinite from `reach` on."""
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(nodes).query(points, k=np.arange(1, min(count, len(nodes)) + 1), distance_upper_bound=reach)
+    return distance, index
+
+
 def node_spacing(nodes: np.ndarray) -> float:
     """Distance between neighboring nodes of a body [N, 3], m: the 0.9 quantile of the edges of its minimum spanning tree.
 
@@ -34,12 +42,10 @@ def node_spacing(nodes: np.ndarray) -> float:
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
-    from scipy.spatial import cKDTree
 
     points = np.asarray(nodes, np.float64)
-    count = min(TREE_NEIGHBORS + 1, len(points))
-    distance, partner = cKDTree(points).query(points, k=count)
-    first = np.repeat(np.arange(len(points)), count)
+    distance, partner = nearest(points, points, TREE_NEIGHBORS + 1)
+    first = np.repeat(np.arange(len(points)), distance.shape[1])
     # Where all neighbors are nearer than the next part of the body, the tree is a forest: the few edges between are not missed.
     near = coo_array((distance.ravel(), (first, partner.ravel())), shape=(len(points), len(points)))
     edges = minimum_spanning_tree(near.tocsr()).data
@@ -54,9 +60,7 @@ def controller_reach(nodes: np.ndarray, controllers: np.ndarray) -> float:
 
     Of a filmed hand most points are on fingers and forearm, far from what it holds, so the mean distance says nothing.
     """
-    from scipy.spatial import cKDTree
-
-    return float(cKDTree(np.asarray(nodes, np.float64)).query(np.asarray(controllers, np.float64))[0].min())
+    return float(nearest(np.asarray(nodes, np.float64), np.asarray(controllers, np.float64), 1)[0].min())
 
 
 MIN_LENGTH = 1e-4
@@ -96,7 +100,7 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     centroids = np.round([places[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
-    return np.asarray(number[clusters])
+    return number[clusters]
 
 
 def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
@@ -120,11 +124,9 @@ def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
         largest = np.flatnonzero(sizes == sizes.max())
         for label in np.setdiff1d(np.arange(pieces), largest if len(largest) == 1 else []):
             own, rest = np.flatnonzero(piece == label), np.flatnonzero(piece != label)
-            tree = cKDTree(nodes[rest])
             # Nodes at the same place are no partners.
-            same = max(tree.query_ball_point(nodes[own], MIN_LENGTH, return_length=True))
-            k = min(REPAIR_SPRINGS + same, len(rest))
-            distance, partner = (found.reshape(len(own), k) for found in tree.query(nodes[own], k=k))
+            same = max(cKDTree(nodes[rest]).query_ball_point(nodes[own], MIN_LENGTH, return_length=True))
+            distance, partner = nearest(nodes[rest], nodes[own], REPAIR_SPRINGS + same)
             usable = distance > MIN_LENGTH
             away = np.where(usable, distance, np.inf).min(axis=1)
             row, column = np.nonzero(usable & (usable.cumsum(axis=1) <= REPAIR_SPRINGS) & (away <= away.min() + spacing)[:, None])
@@ -139,33 +141,24 @@ def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray)
 
     Node i asks for its `neighbors[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
     """
-    from scipy.spatial import cKDTree
-
-    count = len(nodes)
-    k = int(min(neighbors.max(), count))
-    distance, partner = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=float(radius.max()))
-    distance, partner = distance.reshape(count, k), partner.reshape(count, k)
-    rank = np.arange(k)
+    distance, partner = nearest(nodes, nodes, int(neighbors.max()), float(radius.max()))
+    rank = np.arange(distance.shape[1])
     # The first hit is the node itself (or an exact duplicate, which the length rule would refuse anyway).
     wanted = (rank > 0) & (rank < neighbors[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
     first, column = np.nonzero(wanted)
-    return _first_of_each(np.stack([first, partner[first, column]], axis=1), count)
+    return _first_of_each(np.stack([first, partner[first, column]], axis=1), len(nodes))
 
 
 def _first_of_each(pairs: np.ndarray, count: int) -> np.ndarray:
     """Keep the first occurrence of every unordered pair."""
     ordered = np.sort(pairs, axis=1)
     _, index = np.unique(ordered[:, 0] * count + ordered[:, 1], return_index=True)
-    return np.asarray(pairs[np.sort(index)])
+    return pairs[np.sort(index)]
 
 
 def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
     """Springs from controllers to object nodes, [S, 2] as (N + controller, node)."""
-    from scipy.spatial import cKDTree
-
-    k = min(neighbors, len(nodes))
-    distance, partner = cKDTree(nodes).query(controllers, k=k, distance_upper_bound=radius)
-    distance, partner = distance.reshape(len(controllers), k), partner.reshape(len(controllers), k)
+    distance, partner = nearest(nodes, controllers, neighbors, radius)
     controller, column = np.nonzero(distance < radius)
     return np.stack([len(nodes) + controller, partner[controller, column]], axis=1)
 

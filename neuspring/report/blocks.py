@@ -118,16 +118,11 @@ def markdown(blocks: Sequence[Block]) -> str:
     return "\n\n".join(parts) + "\n" if parts else ""
 
 
-def table_of_page(table: Table) -> str:
-    """A table as HTML."""
-    return lay_out(table, "html")
-
-
 def html_page(title: str, subtitle: str, sections: Sequence[PageSection], *, written: str = "") -> str:
     """The page as text; nothing but what it contains may be loaded."""
     loader = jinja2.FileSystemLoader(PAGE_TEMPLATES)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters |= {"coded": coded, "table": table_of_page}
+    environment.filters |= {"coded": coded, "lay_out": lay_out}
     texts = {name: Markup((PAGE_TEMPLATES / name).read_text(encoding="utf-8")) for name in ("style.css", "page.js")}
     values = {"title": title, "subtitle": subtitle, "sections": sections, "written": written}
     return environment.get_template("page.html.j2").render(**values, style=texts["style.css"], script=texts["page.js"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 from neuspring.checks import examine
 from neuspring.core.findings import Finding
@@ -20,7 +19,7 @@ def of_runs(runs: Iterable[RunRecord]) -> list[tuple[str, Finding]]:
     runs = list(runs)
     found = of_fits(runs)
     for run in runs:
-        facts: dict[str, Any] = run.params
+        facts = run.params
         ends = str(facts.get("search.result.at_ends") or "")
         springs, inner = (
             facts.get(f"fit.result.{name}", facts.get(f"search.result.{name}")) for name in ("springs", "object_springs")

@@ -6,7 +6,6 @@ read.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from neuspring.core.job_records import asked, read_jobs
 from neuspring.core.records import now
 from neuspring.core.text import listed
 from neuspring.registry import Registry, modules
-from neuspring.report.blocks import Block, PageSection, html_page
+from neuspring.report.blocks import PageSection, html_page
 from neuspring.report.data import Options, ReportData, ReportSection, damaged_files, traces
 from neuspring.report.tables import Compared, several
 from neuspring.scores.table import as_asked, collect
@@ -42,7 +41,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
     counts = [several(len(getattr(choice, f"{noun}s")), noun) for noun in ("scenario", "method", "seed")]
     subtitle = f"{', '.join(counts)}; {results.resolve().name}."
     ordered = sorted(REPORT_SECTIONS.items(), key=lambda pair: (pair[1].order, pair[0]))
-    made: dict[str, Sequence[Block]] = {}
+    made = {}
 
     def make(phase: int) -> None:
         made.update({name: section.make(material) for name, section in ordered if section.phase == phase})

@@ -152,7 +152,7 @@ def _run(folder: Path, scenario_folder: Path) -> Run:
     run = RunFolder.of(folder, notes)
     model = "fit" if "fit" in run.stages else "search"
     places = {"twin": model, "trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
-    paths: dict[str, Path] = {}
+    paths = {}
     for role, stage in places.items():
         try:
             if (found := run.file(stage, role)) is None:

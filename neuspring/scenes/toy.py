@@ -117,8 +117,7 @@ def true_stiffness(kind: str, shape: Shape, topology: Topology) -> np.ndarray:
     low, high = position.min(), position.max()
     unit = (position - low) / (high - low)
     level = np.sin(2 * np.pi * unit) if kind == "smooth" else np.where(unit < 0.5, 1.0, -1.0)
-    stiffness: np.ndarray = shape.stiffness * 2.0**level
-    return stiffness
+    return shape.stiffness * 2.0**level
 
 
 @dataclass(frozen=True)

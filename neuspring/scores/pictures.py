@@ -26,7 +26,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     One value per leading index. Equal pictures: inf, without a usable gradient.
     """
     check_pair("psnr", a, b)
-    squared: torch.Tensor = (a - b).square().mean(dim=(-3, -2, -1))
+    squared = (a - b).square().mean(dim=(-3, -2, -1))
     return -10.0 * torch.log10(squared)
 
 
@@ -83,8 +83,9 @@ class Pair:
     """[H, W] bool."""
 
     @classmethod
-    def of(cls, observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray, hands: np.ndarray) -> Pair:
-        """From bytes, as `masked_pair` takes them."""
+    def of(cls, observed: np.ndarray, rendered: np.ndarray, labels: np.ndarray) -> Pair:
+        """From bytes, as `masked_pair` takes them, and labels [H, W]."""
+        mask, hands = (np.where(own, 255, 0).astype(np.uint8) for own in (labels == OBJECT, labels >= HANDS))
         truth, prediction = masked_pair(observed, mask, rendered, hands)
         return cls(observed, rendered, truth, prediction, silhouettes(mask, rendered, hands, OBJECT_COVERAGE), hands > 0)
 
@@ -160,6 +161,5 @@ class Scored:
     def pair(self, name: str, frame: int, gaussians: Gaussians) -> Pair:
         """Observed and predicted picture of one camera in one frame."""
         labels = self.masks[name][frame] if self.masks else self.capture.mask(name, frame)
-        mask, hands = (np.where(own, 255, 0).astype(np.uint8) for own in (labels == OBJECT, labels >= HANDS))
         rendered = picture(gaussians, self.views[name], self.backend)
-        return Pair.of(self.capture.color(name, frame), rendered, mask, hands)
+        return Pair.of(self.capture.color(name, frame), rendered, labels)

@@ -220,7 +220,7 @@ def _filled(runs: pd.DataFrame) -> pd.DataFrame:
 
 def settings_of(record: RunRecord) -> dict[str, Any]:
     """The settings of all stages under dotted names; a section named like its stage is not named twice."""
-    named: dict[str, Any] = {"stages": " + ".join(name for name in PREDICTING_STAGES if name in record.settings)}
+    named = {"stages": " + ".join(name for name in PREDICTING_STAGES if name in record.settings)}
     for stage, settings in record.settings.items():
         values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
         named |= {f"{stage}.{name}": value for name, value in values.items() if name.split(".")[-1] not in NOT_SETTINGS}
@@ -304,7 +304,7 @@ def read_transfers(
         path = Path(results) / scenario / method / str(seed) / "transfer.json"
         if not path.is_file():
             continue
-        row: dict[str, Any] = {"scenario": scenario, "method": method, "seed": seed, "notes": ""}
+        row = {"scenario": scenario, "method": method, "seed": seed, "notes": ""}
         try:
             record = StageRecord.load(path)
             table = pd.read_parquet(record.file("scores", path))

@@ -98,7 +98,7 @@ class _Blend(torch.autograd.Function):
         *inputs, left, ends = ctx.saved_tensors
         means, conics, strengths, features = inputs
         adjoints = [torch.zeros_like(tensor) for tensor in (means, conics, strengths[:, 0], features)]
-        limits: Limits = ctx.limits
+        limits = ctx.limits
         adj_means, adj_conics, adj_opacities, adj_features = adjoints
         arguments = [*_vectors(*inputs), *_lists(ctx.lists), limits.alpha_min, limits.alpha_max, *_scalars(left.detach(), ends)]
         arguments += [*_vectors(adj_total.contiguous()), *_scalars(adj_left.contiguous())]

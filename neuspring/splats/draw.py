@@ -63,7 +63,7 @@ def picture(gaussians: Gaussians, view: View, backend: Backend, background: tupl
     """RGBA [H, W, 4] uint8: color over the background, and coverage."""
     drawn = gaussians.draw(view, background=background, backend=backend)
     rgba = torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1).clamp(0, 1)
-    return np.asarray((255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy())
+    return (255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy()
 
 
 def orbit_view(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:

@@ -111,7 +111,7 @@ def _on_torch_stream(device: str) -> AbstractContextManager[Any]:
     """Torch orders its own work on its current stream, so copies, grid and kernels must run there too."""
     if device == "cpu":
         return nullcontext()
-    stream: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
     return stream
 
 

@@ -141,7 +141,7 @@ def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor
     xy = (u * v).sum(-1)
     yy = (v * v).sum(-1) + limits.blur
     # (u.u + blur)(v.v + blur) - (u.v)^2 = |u x v|^2 + blur (u.u + v.v) + blur^2 without the cancellation of long needles.
-    area: torch.Tensor = torch.linalg.cross(u, v)
+    area = torch.linalg.cross(u, v)
     determinant = (area * area).sum(-1) + limits.blur * ((u * u).sum(-1) + (v * v).sum(-1)) + limits.blur * limits.blur
     conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
     return Projected(index, flat, torch.stack([xx, xy, yy], dim=-1), conics, z)

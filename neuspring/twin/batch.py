@@ -85,7 +85,7 @@ class SimulatedTwin:
     @property
     def collision_overflow(self) -> int:
         """Collision candidates that did not fit the list, summed over all solvers so far."""
-        return self._overflow + (self._window.collision_overflow if self._window is not None else 0)
+        return self._overflow + (sum(self._window.overflows) if self._window else 0)
 
 
 @dataclass(frozen=True, eq=False)

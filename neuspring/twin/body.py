@@ -253,7 +253,7 @@ def with_mass(twin: Twin, total: float) -> Twin:
 
 
 def _scaled(part: Any, factor: float) -> Any:
-    changed: dict[str, Any] = {}
+    changed = {}
     for spec in fields(part):
         value = getattr(part, spec.name)
         if isinstance(value, Artifact):

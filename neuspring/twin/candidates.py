@@ -109,7 +109,7 @@ class SearchProblem:
     @property
     def names(self) -> tuple[str, ...]:
         """All that makes a candidate: the variables of the settings, regional ones as name.0, name.1, ... (bare for one)."""
-        names: list[str] = []
+        names = []
         for name in VARIABLES:
             regional = name in REGIONAL and self.clusters > 1
             names += [f"{name}.{region}" for region in range(self.clusters)] if regional else [name]

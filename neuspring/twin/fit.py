@@ -348,7 +348,7 @@ class TwinFit:
             state, mean = yield from recording.simulate(state, window, packed, limit)
             if not bool(torch.isfinite(mean)):
                 raise NonFinite(f"the loss is not finite in frames {window.start} to {window.stop - 1}")
-            gradients: Sequence[torch.Tensor | None] = [None] * len(self.trained)
+            gradients = [None] * len(self.trained)
             if mean.requires_grad:
                 gradients = yield GradientRequest(self.loss_scale * mean, self.trained)
             left_out += limit.left_out if limit is not None else 0

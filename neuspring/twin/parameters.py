@@ -120,7 +120,7 @@ class TwinParameters(nn.Module):
 
     def deviation(self) -> torch.Tensor:
         """Factor of each spring's stiffness [S], apart from common factors."""
-        offsets: torch.Tensor = self.offsets if self.offsets is not None else self.field()  # type: ignore[misc]
+        offsets = self.offsets if self.offsets is not None else self.field()  # type: ignore[misc]
         return bounded(offsets[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:

@@ -25,6 +25,13 @@ class Diverged(Exception):
         self.frame, self.reason = frame, reason
 
 
+def left_scene(x: torch.Tensor, frame: int, reach: float = FAR_AWAY, what: str = "node") -> str:
+    """The first of the points [N, 3], m, that is farther than `reach` from the origin, in words; empty where none is."""
+    # NaN compares false, so this catches it together with infinity and absurd distances.
+    near = (x.abs() < reach).all(dim=1)
+    return "" if bool(near.all()) else f"{what} {int((~near).nonzero()[0])} left the scene in frame {frame}"
+
+
 def frames(
     twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
@@ -36,10 +43,8 @@ def frames(
     v = torch.zeros_like(x) if velocity is None else torch.tensor(velocity, dtype=x.dtype, device=x.device)
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
-        # NaN compares false, so this catches it together with infinity and absurd distances.
-        near = (x.abs() < FAR_AWAY).all(dim=1)
-        if not bool(near.all()):
-            raise Diverged(frame, f"node {int((~near).nonzero()[0])} left the scene in frame {frame}")
+        if reason := left_scene(x, frame):
+            raise Diverged(frame, reason)
         yield frame, x, v
 
 

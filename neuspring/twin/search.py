@@ -241,7 +241,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
     if problem.quirks.integer_damping:
         values |= {name: float(int(values[name])) for name in ("drag", "dashpot")}
     twin = candidate(problem, values, push)
-    facts: dict[str, Any] = {
+    facts = {
         **values,
         "hands": "push" if twin.topology.pushes.any() else "hold",
         "cost": float(best["cost"]),

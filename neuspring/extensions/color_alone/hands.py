@@ -171,7 +171,7 @@ def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: 
         cv2.circle(around, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
         found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & around, blockSize=3)  # type: ignore[operator]
         if found is not None and len(found) >= 3 * LEAST_CORNERS:
-            return np.asarray(found.reshape(-1, 2))
+            return found.reshape(-1, 2)
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))
 
 
@@ -238,7 +238,7 @@ def rays(image: ImageObservations) -> np.ndarray:
     """Rays K^-1 [x, y, 1] through the grips [T, H, 3]: points at depth 1 in camera axes."""
     pixels = image.hand_centers.astype(np.float64)
     ones = np.ones((*pixels.shape[:-1], 1))
-    return np.asarray(np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(image.intrinsics).T)
+    return np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(image.intrinsics).T
 
 
 def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 def away_from(mask: np.ndarray) -> np.ndarray:
     """Distance of each pixel [H, W] from the nearest one of a mask, pixels."""
-    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5))
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
 
 
 def core_of(mask: np.ndarray, least: float = 0.0) -> np.ndarray:
@@ -19,7 +19,7 @@ def core_of(mask: np.ndarray, least: float = 0.0) -> np.ndarray:
 
 def disc(radius: int) -> np.ndarray:
     """A disc [2 radius + 1, 2 radius + 1] to dilate with."""
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2))
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
 
 
 def pixels_of(mask: np.ndarray) -> np.ndarray:

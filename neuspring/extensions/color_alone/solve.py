@@ -222,7 +222,7 @@ def _local_density(lab: np.ndarray, rest: np.ndarray) -> np.ndarray:
     def blurred(values: np.ndarray) -> np.ndarray:
         small = cv2.resize(values, None, fx=1 / COARSE, fy=1 / COARSE, interpolation=cv2.INTER_AREA)
         smooth = cv2.GaussianBlur(small, (0, 0), width / COARSE)
-        return np.asarray(cv2.resize(smooth, rest.shape[::-1]).reshape(*rest.shape, -1))
+        return cv2.resize(smooth, rest.shape[::-1]).reshape(*rest.shape, -1)
 
     share = np.maximum(blurred(weight), 1e-4)
     mean = blurred(weight * image) / share
@@ -345,7 +345,7 @@ class Pass:
 
         def brought(values: np.ndarray) -> np.ndarray:
             image = np.ascontiguousarray(values)
-            return np.asarray(cv2.remap(image, came_x, came_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+            return cv2.remap(image, came_x, came_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
         change = cv2.absdiff(np.ascontiguousarray(lab), brought(last)).max(axis=-1).astype(np.float32)
         doubt = np.clip(cv2.GaussianBlur(change, (0, 0), 1.5) / CHANGED, 0.05, 1.0)

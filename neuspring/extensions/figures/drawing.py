@@ -20,7 +20,7 @@ from neuspring.draw.painter import DRAWN_MM, Error, distances
 from neuspring.draw.scene import VIEW_ELEVATION, chosen_frames
 from neuspring.draw.strip import strip_figure
 from neuspring.draw.twin import twin_figure
-from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun, Style, SurfacePicture
+from neuspring.extensions.figures.filmed import FilmedScene, PhotoPainter, PhotoStyle, SplatRun, SurfacePicture
 from neuspring.extensions.figures.options import ComparedOptions, FilmOptions, RunOptions, StripOptions, TwinOptions
 from neuspring.report.shown import Found, Run, find
 
@@ -180,7 +180,7 @@ def _without_splats(chosen: Chosen, required: bool, remedy: str = "") -> str:
 def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> PhotoPainter:
     """The painter of a strip or a film; `error` is drawn where the options ask for none, None stands for the best there is."""
     without = _without_splats(chosen, a.style == "splats", "Leave out --as splats to draw nodes.")
-    style: Style = a.style or ("nodes" if without else "splats")
+    style = a.style or ("nodes" if without else "splats")
     if without and a.style is None and chosen.found.capture is not None:
         print(f"Nodes are drawn, since there are no splats for {without}")
     scene = _scene(a, chosen, frames, chosen.takes)

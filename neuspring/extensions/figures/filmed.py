@@ -144,8 +144,7 @@ class PhotoPainter(Painter):
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is None or labels is None:
             return Drawn(self.scene.cut(rgba))
-        own, hands = (np.where(part, 255, 0).astype(np.uint8) for part in (labels == OBJECT, labels >= HANDS))
-        pair = Pair.of(photo, rgba, own, hands)
+        pair = Pair.of(photo, rgba, labels)
         difference = (pair.truth - pair.prediction).abs().mean(0).numpy()
         shows = pair.silhouettes[0] | pair.silhouettes[1]
         cut = self.scene.cut
@@ -233,7 +232,7 @@ class SurfacePicture(TwinPicture):
         rgb = self.node_colors(take, quantity)[nearest, :3]
         (gaussians,) = (found for _, found in take.gaussians([self.frame], self.device))
         plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
-        painted: Gaussians = replace(gaussians, harmonics=plain)
+        painted = replace(gaussians, harmonics=plain)
         # Nothing is compared with it, so it need not have the camera's pixels.
         view = view_of(finer(scene.view, 900), self.device)
         return picture(painted, view, choose_backend("auto", self.device))

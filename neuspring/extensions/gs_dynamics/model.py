@@ -34,6 +34,7 @@ from neuspring.core.device import load, start_warp
 from neuspring.core.errors import InputError
 from neuspring.extensions.gs_dynamics.settings import GsDynamics
 from neuspring.splats.skinning import turn_nodes
+from neuspring.twin.rollout import left_scene
 
 HISTORY = 3
 """Steps H that the network sees, the present one included."""
@@ -317,10 +318,8 @@ def predict(model: GsDynamicsModel, observations: Observations, splats: np.ndarr
             after, particles, contacts = make_step(dynamics, history, hands[[*last, frame]])
             counts.append(particles)
             touched.append(contacts)
-            # NaN compares false, so this catches it together with infinity and absurd distances.
-            near = (after.abs() < DIVERGENCE_RADIUS).all(dim=1)
-            if not bool(near.all()):
-                reason, diverged = f"node {int((~near).nonzero()[0])} left the scene in frame {frame}", frame
+            if reason := left_scene(after, frame, DIVERGENCE_RADIUS):
+                diverged = frame
                 break
             frames.append(frame)
             positions.append(after)

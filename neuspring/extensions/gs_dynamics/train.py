@@ -160,7 +160,7 @@ class Windows:
         These are tracks visible in all frames of the window. Fallback if fewer than MIN_VISIBLE: visible in the history only.
         """
         frames = window_frames(tracks.tools, settings)
-        seen: np.ndarray = tracks.visible[frames]
+        seen = tracks.visible[frames]
         throughout = seen.all(axis=1)
         enough = throughout.sum(axis=1, keepdims=True) >= MIN_VISIBLE
         usable = np.where(enough, throughout, seen[:, :HISTORY].all(axis=1))

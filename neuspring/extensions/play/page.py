@@ -87,7 +87,7 @@ class Page:
         # Only what a person does: the clock moves the slider too.
         self.slider.on_update(lambda event: self.show(int(self.slider.value)) if event.client_id is not None else None)
         self.play.on_click(lambda _: self.toggle())
-        keys: dict[Any, Any] = {"space": self.toggle}
+        keys = {"space": self.toggle}
         keys |= {"arrowright": lambda: self.show(clock.frame + 1), "arrowleft": lambda: self.show(clock.frame - 1)}
         for key, action in keys.items():
             gui.add_command(f"Time: {key}", hotkey=key).on_trigger(lambda _, action=action: action())  # type: ignore[misc,arg-type]

@@ -50,7 +50,7 @@ class Simulator:
     @property
     def positions(self) -> np.ndarray:
         """Nodes [N, 3], m."""
-        return np.asarray(self._x.numpy())
+        return self._x.numpy()
 
     def step(self, hands: np.ndarray, grabbed: int = -1, target: np.ndarray | None = None) -> np.ndarray:
         """Nodes [N, 3], m, a frame later: hands move to [C, 3], m, and a grabbed node is pulled to `target` [3], m.

@@ -21,7 +21,7 @@ from neuspring.core.records import StageRecord
 from neuspring.core.table import Cell, Table
 from neuspring.draw.sheet import save
 from neuspring.extensions.rods.metric import DEFORM_L1
-from neuspring.report.blocks import Block, Items
+from neuspring.report.blocks import Items
 from neuspring.scores.metrics import DASH
 from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed
 from neuspring.scores.table import DAMAGED, ScoreTable, collect, read_transfers
@@ -87,7 +87,7 @@ class ClipNumbers(OwnStudy):
         lines = [f"{label}: not run" for label in self.study.rows if label not in set(self.clips["label"])]
         failed = self.records[self.records["status"] != "ok"].itertuples()
         lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
-        last: list[Block] = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+        last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
         return [_overview(self), *([_details(self)] if len(self.clips) else []), *last]
 
     def files(self, folder: Path) -> list[str]:
@@ -134,7 +134,7 @@ class ClipNumbers(OwnStudy):
     def records(self) -> pd.DataFrame:
         """Every transfer that has a record: how it ended, clips that it was to be judged on, files that it kept, in the results."""
         rows = []
-        runs: list[dict[str, Any]] = self._read[1].to_dict("records")  # type: ignore[assignment]
+        runs = self._read[1].to_dict("records")  # type: ignore[assignment]
         for run in runs:
             path = self.results / run["scenario"] / run["method"] / str(run["seed"]) / "transfer.json"
             record = None if run["reason"].startswith(DAMAGED) else StageRecord.load(path)
@@ -151,8 +151,8 @@ class ClipNumbers(OwnStudy):
         `l1_mm` is the mean over clips, seeds averaged within each; `spread_mm` the standard deviation over the seeds that have
         every clip. `ranked`: it is a method, and has every clip that it was to be judged on, with every seed.
         """
-        asked: dict[Any, int] = self.records.groupby("scenario")["targets"].max().to_dict()
-        rows: list[dict[str, Any]] = []
+        asked = self.records.groupby("scenario")["targets"].max().to_dict()
+        rows = []
         for (label, cable, _), value in self.study.values.items():
             assert isinstance(value, PublishedError)
             facts = {"source": value.source, "tag": value.tag, "text": value.text, "ranked": value.tag != "reference"}

@@ -151,7 +151,7 @@ class Variables:
         if self.stiffness_along.shape[1]:
             bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
             twisting = twisting * np.exp(self.stiffness_along @ self.part(q, "twisting_along"))
-        changes: dict[str, Any] = {"bending": bending, "twisting": twisting, "roll": start.roll + float(self.part(q, "roll")[0])}
+        changes = {"bending": bending, "twisting": twisting, "roll": start.roll + float(self.part(q, "roll")[0])}
         changes |= {name: getattr(start, name) * float(factor[name][0]) for name in ("damping", "drag_quadratic")}
         if self.curvature_along.shape[1]:
             coefficients = self.part(q, "curvature").reshape(2, -1)

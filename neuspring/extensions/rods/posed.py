@@ -82,7 +82,7 @@ def _body(line: np.ndarray, normal: np.ndarray, settings: Posed) -> np.ndarray:
     """Nodes [n, 3], m, of rings along the part of a line [M, 3] that begins at the clamp."""
     centers, tangents = centerline(line[1:], RINGS)
     nodes = rings(centers, tangents, transport(tangents, normal), settings.radius, RING)
-    return np.asarray(nodes)
+    return nodes
 
 
 def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:

@@ -14,6 +14,7 @@ from neuspring.baselines.results import DIVERGENCE_RADIUS, Prediction
 from neuspring.core.artifacts import Observations, Trajectory, array
 from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorParameters, AnchorPhysics, AnchorSolver
 from neuspring.extensions.spring_gaus.settings import SpringGaus
+from neuspring.twin.rollout import left_scene
 
 ANCHOR_CELL_SIZES = (0.01, 0.001)
 """Cell sizes of the grids that anchors are drawn from, m."""
@@ -167,9 +168,8 @@ def roll_out(model: SpringGausModel, controllers: np.ndarray, device: str) -> tu
         # As in training: v0 is added on entering a frame and removed on leaving it.
         x, v = solver.frame(parameters, x, v + start, hands[frame - 1], hands[frame])
         v = v - start
-        near = (x.abs() < DIVERGENCE_RADIUS).all(dim=1)
-        if not bool(near.all()):
-            return torch.stack(states), f"anchor {int((~near).nonzero()[0])} left the scene in frame {frame}"
+        if reason := left_scene(x, frame, DIVERGENCE_RADIUS, "anchor"):
+            return torch.stack(states), reason
         states.append(x)
     return torch.stack(states), ""
 

@@ -307,7 +307,7 @@ Paint = Callable[[np.ndarray, Mapping[str, Sdf]], np.ndarray]
 
 def sloth(spacing: float, skin_spacing: float) -> SoftBody:
     """0.3 m long, arms and legs spread. Stiff head, soft limbs."""
-    parts: dict[str, Sdf] = {
+    parts = {
         "body": ellipsoid((0, 0, 0.05), (0.085, 0.06, 0.045)),
         "head": ellipsoid((0.1, 0, 0.062), (0.045, 0.05, 0.042)),
         "snout": ellipsoid((0.138, 0, 0.055), (0.018, 0.022, 0.018)),
@@ -321,7 +321,7 @@ def sloth(spacing: float, skin_spacing: float) -> SoftBody:
 
 def zebra(spacing: float, skin_spacing: float) -> SoftBody:
     """0.28 m long, 0.19 m tall. Stiff head and legs, soft belly and tail."""
-    parts: dict[str, Sdf] = {
+    parts = {
         "body": capsule((-0.055, 0, 0.1), (0.055, 0, 0.104), 0.045),
         "neck": capsule((0.055, 0, 0.11), (0.1, 0, 0.155), 0.03),
         "head": ellipsoid((0.112, 0, 0.163), (0.035, 0.032, 0.03)),
@@ -338,7 +338,7 @@ def zebra(spacing: float, skin_spacing: float) -> SoftBody:
 
 def dinosaur(spacing: float, skin_spacing: float) -> SoftBody:
     """0.32 m long with its tail, 0.2 m tall. Stiff head and tail, soft arms and legs."""
-    parts: dict[str, Sdf] = {
+    parts = {
         "body": ellipsoid((0, 0, 0.08), (0.06, 0.052, 0.065)),
         "neck": capsule((0.03, 0, 0.12), (0.05, 0, 0.165), 0.032),
         "head": ellipsoid((0.07, 0, 0.175), (0.045, 0.035, 0.032)),

@@ -82,7 +82,7 @@ def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
     hands = [carried(controllers[0], poses[:, hand]) for hand in range(poses.shape[1])]
     off = np.stack([np.linalg.norm(places - controllers, axis=2)[1:] for places in hands])
     best = off.mean(axis=1).argmin(axis=0)
-    return np.asarray(off[best, :, np.arange(controllers.shape[1])])
+    return off[best, :, np.arange(controllers.shape[1])]
 
 
 def hull_quality(

@@ -21,6 +21,9 @@ LEAST_ALTITUDE = 0.4
 SNAPPING_STEPS = 40
 EMBEDDING_CANDIDATES = 12
 
+FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])
+"""Corners of the faces of a tetrahedron."""
+
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
@@ -33,7 +36,7 @@ def volumes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 def altitudes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Smallest altitude of each tetrahedron [E], m: 3 V / largest face; negative where inverted."""
     areas = []
-    for i, j, k in ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)):
+    for i, j, k in FACES:
         a, b, c = nodes[tetrahedra[:, i]], nodes[tetrahedra[:, j]], nodes[tetrahedra[:, k]]
         areas.append(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0)
     return np.asarray(3.0 * volumes(nodes, tetrahedra) / np.max(areas, axis=0))
@@ -126,7 +129,7 @@ def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nom
 
 def pieces(tetrahedra: np.ndarray) -> np.ndarray:
     """[E] the piece of each tetrahedron; neighbors share a face."""
-    faces = np.sort(np.concatenate([tetrahedra[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]), axis=1)
+    faces = np.sort(np.concatenate([tetrahedra[:, c] for c in FACES]), axis=1)
     owner = np.tile(np.arange(len(tetrahedra)), 4)
     order = np.lexsort(faces.T)
     same = (np.diff(faces[order], axis=0) == 0).all(axis=1)

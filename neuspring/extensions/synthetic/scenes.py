@@ -98,7 +98,7 @@ class SyntheticScene:
 
 def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFrame, ...]:
     """Key frames that visit start + offset in turn, again and again, at MEAN_SPEED, until `duration` is over."""
-    keys: list[KeyFrame] = [(0.0, tuple(start), (0.0, 0.0, 0.0))]
+    keys = [(0.0, tuple(start), (0.0, 0.0, 0.0))]
     now, here, k = 0.0, np.asarray(start, float), 0
     while now < duration:
         there = start + np.asarray(offsets[k % len(offsets)])

@@ -114,7 +114,7 @@ def at_points(truth: Truth, points: np.ndarray) -> MaterialPoints:
 def _ask(truth: Truth, kernel: wp.Kernel, count: int, *where: object) -> MaterialPoints:
     indices = on_cpu(truth.surface_faces.astype(np.int32).ravel(), wp.int32)
     mesh = wp.Mesh(on_cpu(truth.surface(0), wp.vec3), indices)
-    face: wp.array = wp.empty(count, dtype=wp.int32, device="cpu")
-    weights: wp.array = wp.zeros(count, dtype=wp.vec3, device="cpu")
+    face = wp.empty(count, dtype=wp.int32, device="cpu")
+    weights = wp.zeros(count, dtype=wp.vec3, device="cpu")
     wp.launch(kernel, count, [mesh.id, *where, FARTHEST_TRUTH, face, weights], device="cpu")
     return MaterialPoints(truth, np.asarray(face.numpy()), np.asarray(weights.numpy(), dtype=float))

@@ -139,7 +139,7 @@ def _fitted(problem: FitProblem, settings: Config, report: Any) -> float:
     result = fit(problem, on_epoch=report)
     if settings.fit.selection == "tail":
         return result.best_loss  # the start may be best
-    rows: list[dict[str, Any]] = result.history.to_dict("records")  # type: ignore[assignment]
+    rows = result.history.to_dict("records")  # type: ignore[assignment]
     kept = [row for row in rows if not row["rolled_back"] and eligible(row["epoch"], problem)]
     if not kept:
         raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.facts['rollbacks'])}")

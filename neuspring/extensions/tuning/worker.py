@@ -49,7 +49,7 @@ def study_of(folder: Path, tune: Tune, facts: Mapping[str, Any], *, begin: bool 
     uri = tune.storage or sqlalchemy.URL.create("sqlite", database=str((folder / DATABASE).resolve())).render_as_string()
     # A server may close connections that are idle during a long fit; SQLite waits for another writer.
     engine = {"pool_pre_ping": True} if tune.storage else {"connect_args": {"timeout": 60}}
-    begun: dict[str, Any] = {}
+    begun = {}
     if begin or tune.storage or (folder / DATABASE).is_file():
         folder.mkdir(parents=True, exist_ok=True)
         # Several processes must not create the tables at once.

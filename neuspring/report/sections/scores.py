@@ -11,7 +11,7 @@ def scores(material: ReportData) -> list[Block]:
     """Averages, breakdowns, ratios, aims."""
     if not len(material.table.finished):
         return [Text(text="No run has finished.", tone="mute")]
-    blocks: list[Block] = summary_blocks(material.numbers)
+    blocks = summary_blocks(material.numbers)
     if drawn := ratios_drawn(material.numbers):
         blocks.append(shown_figure(drawn[1], drawn[0]))
     return blocks

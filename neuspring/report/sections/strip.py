@@ -47,7 +47,7 @@ def around(panels: np.ndarray) -> tuple[slice, slice]:
 
 def strip(material: ReportData) -> list[Block]:
     """A row of pictures per scenario; none where no run has a film."""
-    rows: list[Block] = []
+    rows = []
     for scenario in material.choice.scenarios:
         films = {name: material.file(run, "images", "video") for name, run in material.first_runs(scenario).items()}
         ends = {name: end for name, path in films.items() if path and (end := material.read(path, last_frame))}

@@ -99,8 +99,7 @@ and it goes on for the rest of dt.
     def solver(self, twin: Twin, device: str = "cpu") -> FrameSolver:
         from neuspring.physics.solver import solver_for
 
-        solver: FrameSolver = solver_for(twin, device, differentiable=False)
-        return solver
+        return solver_for(twin, device, differentiable=False)
 
     def check(self, twin: Twin) -> None:
         stability.check(twin)
@@ -141,7 +140,7 @@ and it goes on for the rest of dt.
         degree = np.bincount(pairs.ravel(), minlength=nodes)
         total = np.bincount(pairs.ravel(), np.repeat(np.log(values), 2), minlength=nodes)
         typical = float(np.median(np.log(values))) if count else 0.0
-        return np.asarray(np.exp(np.where(degree > 0, total / np.maximum(degree, 1), typical)))
+        return np.exp(np.where(degree > 0, total / np.maximum(degree, 1), typical))
 
     def mass_at(self, twin: Twin, node: int) -> float:
         return float(twin.material.mass[node]) if len(twin.material.mass) else 1.0

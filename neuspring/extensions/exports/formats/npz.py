@@ -99,8 +99,8 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
     """Arrays, and what is said of each: dimensions, shape, dtype, unit, meaning."""
-    arrays: dict[str, np.ndarray] = {}
-    described: dict[str, dict[str, Any]] = {}
+    arrays = {}
+    described = {}
 
     def add(name: str, dimensions: str, unit: str, about: str, value: np.ndarray) -> None:
         arrays[name] = value
