@@ -101,7 +101,8 @@ checks = (
           "correlation of motion in masks and images, relative to the images that they fit best",
           f"{SHEET} Give each camera its own masks.", effect="masks show another camera or recording"),
     Check("repeated images", "repeats", timing.repeats, (0, 0), "warning",
-          "images that are equal to the one before", "Record at the sensor's own rate, or keep one of each, as with make-capture --frames 0-300/2.", unit="images",
+          "images that are equal to the one before",
+          "Record at the sensor's own rate, or keep one of each, as with make-capture --frames 0-300/2.", unit="images",
           effect="motion stands still and jumps, and images equal to the bit are not scored"),
     # Points from frame to frame
     Check("lost points as numbers", "moving", lambda one, _: moving.lost(one), (0, 0), "error",
