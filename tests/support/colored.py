@@ -104,5 +104,6 @@ def paint(folder, category="cloth", frames=8, spoiled=False):
             image[:] = 255 - image
             labels[labels == OBJECT] = 0
         image[labels == HANDS] = moved[labels == HANDS]
+        image[0, 0] = frame  # Images equal to the bit would show nothing new.
         writer.frame("0", frame, image, None, labels)
     return writer.finish()
