@@ -21,7 +21,7 @@ from neuspring.core.device import load, start_warp
 from neuspring.physics.lanes import lanes, width_for
 from neuspring.physics.parameters import PARAMETERS, Parameters
 
-UNFUSED: dict[str, Any] = {"module": "unique", "enable_backward": False, "module_options": {"fuse_fp": False}}
+UNFUSED = {"module": "unique", "enable_backward": False, "module_options": {"fuse_fp": False}}
 """Options of the kernels of a frame. A fused product and sum rounds once, and a GPU fuses where a CPU does not: contacts then flip
 on one of them alone."""
 

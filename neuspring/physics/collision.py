@@ -117,7 +117,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
     Model, State, _ = structs(real, width)
     column, dot, root = lane.column, lane.dot, lane.root
     numbers: Any = wp.array2d(dtype=Number)
-    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
+    zero, one = real(0.0), real(1.0)
     points: Any = wp.array(dtype=wp.types.vector(3, real))
     counts: Any = wp.array3d(dtype=int)
 
@@ -276,9 +276,9 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
     Number, Vector, plain = lane.Number, lane.Vector, lane.plain
     Model, State, Adjoint = structs(real, width)
     dot, root, scaled, divided = lane.dot, lane.root, lane.scaled, lane.divided
-    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
-    approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
-    half = wp.constant(Number(*[real(0.5)] * width))
+    zero, one = real(0.0), real(1.0)
+    approach, floor = real(APPROACH), real(MIN_TANGENT)
+    half = Number(*[real(0.5)] * width)
 
     @wp.func
     def whole(value: real) -> Number:

@@ -59,7 +59,7 @@ def lanes(real: Any, width: int) -> Lanes:
     Number = wp.types.vector(width, real)
     Vector = wp.types.matrix((3, width), real)
     vec3 = wp.types.vector(3, real)
-    floor = wp.constant(real(MIN_SPRING_LENGTH))
+    floor = real(MIN_SPRING_LENGTH)
 
     @wp.func
     def dot(a: Vector, b: Vector) -> Number:

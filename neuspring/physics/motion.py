@@ -41,7 +41,7 @@ def velocity(real: Any, width: int) -> tuple[Any, Any, Any]:
     lane = lanes(real, width)
     Number, Vector, dot, scaled = lane.Number, lane.Vector, lane.dot, lane.scaled
     Model, State, _ = structs(real, width)
-    one = wp.constant(real(1.0))
+    one = real(1.0)
 
     @wp.func
     def move_controller(model: Model, state: State, step: int, slot: int, c: int, g: int):
@@ -76,8 +76,8 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
     lane = lanes(real, width)
     Number, Vector, scaled, column, put = lane.Number, lane.Vector, lane.scaled, lane.column, lane.put
     vec3 = wp.types.vector(3, real)
-    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
-    approach, floor = wp.constant(real(APPROACH)), wp.constant(real(MIN_TANGENT))
+    zero, one = real(0.0), real(1.0)
+    approach, floor = real(APPROACH), real(MIN_TANGENT)
 
     @wp.func
     def count() -> int:

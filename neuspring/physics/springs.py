@@ -80,7 +80,7 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
     Model, State, Adjoint = structs(real, width)
     dot, scaled, root, divided, floored = lane.dot, lane.scaled, lane.root, lane.divided, lane.floored
     plain = lane.plain
-    one = wp.constant(Number(*[real(1.0)] * width))
+    one = Number(*[real(1.0)] * width)
 
     @wp.func
     def force(offset: Vector, relative: Vector, p: Vector) -> Vector:
@@ -108,57 +108,50 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
 
     @wp.func
+    def sides(p: Vector) -> Number:
+        """-1 for a spring that only pushes, 1 for others."""
+        side = Number()
+        for q in range(width):
+            side[q] = wp.where(p[1, q] < real(0.0), real(-1.0), real(1.0))
+        return side
+
+    @wp.func
+    def acts(offset: Vector, p: Vector) -> Number:
+        """0 for a spring that only pushes and is longer than at rest, 1 for others."""
+        ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
+        act = Number()
+        for q in range(width):
+            act[q] = wp.where(ratio[q] < real(-1.0), real(0.0), real(1.0))
+        return act
+
+    @wp.func
+    def acting(p: Vector, act: Number, side: Number) -> Vector:
+        """The parameters with what does not act taken out."""
+        return wp.matrix_from_rows(wp.cw_mul(p[0], act), wp.cw_mul(p[1], side), wp.cw_mul(p[2], act))
+
+    # Without springs that only push, Warp leaves out what `pushes` decides.
+    @wp.func
     def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
         """The force of spring e on an end at x with velocity v, from its other end j."""
-        return force(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g])
+        offset = state.x[slot, j, g] - x
+        p = model.springs[e, g]
+        if pushes:  # noqa: SIM102
+            if j >= model.nodes:
+                p = acting(p, acts(offset, p), sides(p))
+        return force(offset, state.v[slot, j, g] - v, p)
 
     @wp.func
     def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, c: Vector):
-        return force_adjoint(state.x[slot, j, g] - x, state.v[slot, j, g] - v, model.springs[e, g], c)
-
-    if pushes:
-
-        @wp.func
-        def sides(p: Vector) -> Number:
-            """-1 for a spring that only pushes, 1 for others."""
-            side = Number()
-            for q in range(width):
-                side[q] = wp.where(p[1, q] < real(0.0), real(-1.0), real(1.0))
-            return side
-
-        @wp.func
-        def acts(offset: Vector, p: Vector) -> Number:
-            """0 for a spring that only pushes and is longer than at rest, 1 for others."""
-            ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
-            act = Number()
-            for q in range(width):
-                act[q] = wp.where(ratio[q] < real(-1.0), real(0.0), real(1.0))
-            return act
-
-        @wp.func
-        def acting(p: Vector, act: Number, side: Number) -> Vector:
-            """The parameters with what does not act taken out."""
-            return wp.matrix_from_rows(wp.cw_mul(p[0], act), wp.cw_mul(p[1], side), wp.cw_mul(p[2], act))
-
-        @wp.func
-        def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
-            offset = state.x[slot, j, g] - x
-            p = model.springs[e, g]
-            if j >= model.nodes:
-                p = acting(p, acts(offset, p), sides(p))
-            return force(offset, state.v[slot, j, g] - v, p)
-
-        @wp.func
-        def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, c: Vector):
-            offset = state.x[slot, j, g] - x
-            relative = state.v[slot, j, g] - v
-            p = model.springs[e, g]
+        offset = state.x[slot, j, g] - x
+        relative = state.v[slot, j, g] - v
+        p = model.springs[e, g]
+        if pushes:  # noqa: SIM102
             if j >= model.nodes:
                 act = acts(offset, p)
                 side = sides(p)
                 adj_offset, adj_relative, adj_p = force_adjoint(offset, relative, acting(p, act, side), c)
                 return adj_offset, adj_relative, acting(adj_p, act, wp.cw_mul(act, side))
-            return force_adjoint(offset, relative, p, c)
+        return force_adjoint(offset, relative, p, c)
 
     @wp.func
     def add_row(model: Model, state: State, slot: int, i: int, g: int):

@@ -112,27 +112,22 @@ FAR_SIDE = 0.03
 """m behind the front-most candidate, beyond which a node is taken to be on another side of the object."""
 
 
-def points_in_image(
-    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, marked: np.ndarray, surface: int
-) -> np.ndarray:
+def points_in_image(camera: Camera, positions: np.ndarray, marked: np.ndarray, surface: int) -> np.ndarray:
     """Mean distance per frame [F], px, of marked points from where the prediction carries them; NaN where none can be compared.
 
-    intrinsics [3, 3], px; camera_to_world [4, 4], m; positions of nodes [F, N, 3], m, of which the first `surface` can be seen;
+    positions of nodes [F, N, 3], m, of which the first `surface` can be seen;
     marked [F or more, K, 2], px, NaN where a point is not marked. A point that frame 0 does not have is left out.
     """
-    places = carried_in_image(intrinsics, camera_to_world, positions, marked[0], surface)
+    places = carried_in_image(camera, positions, marked[0], surface)
     errors = np.linalg.norm(places - marked[: len(places)], axis=2)
     return means(errors, np.isfinite(errors))
 
 
-def carried_in_image(
-    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, start: np.ndarray, surface: int
-) -> np.ndarray:
+def carried_in_image(camera: Camera, positions: np.ndarray, start: np.ndarray, surface: int) -> np.ndarray:
     """Places [F, K, 2], px, to which the nodes around them carry pixels [K, 2] of frame 0; NaN stays.
 
     Other arguments as in `points_in_image`. The nodes must lie in front of the camera. They are chosen once, in frame 0.
     """
-    camera = Camera("", 0, 0, intrinsics, camera_to_world)
     pixels, depth = camera.project(positions[:, :surface].astype(np.float64))
     places = np.full((len(positions), *np.shape(start)), np.nan)
     for k, pixel in enumerate(np.asarray(start, np.float64)):
@@ -142,9 +137,7 @@ def carried_in_image(
     return places
 
 
-def points_on_table(
-    intrinsics: np.ndarray, camera_to_world: np.ndarray, positions: np.ndarray, marked: np.ndarray, surface: int, up: float
-) -> np.ndarray:
+def points_on_table(camera: Camera, positions: np.ndarray, marked: np.ndarray, surface: int, up: float) -> np.ndarray:
     """As `points_in_image`, m on the table, of points of flat things that touch it: NaN where there is none.
 
     A thing is flat if no node of frame 0 is FLAT or more above the table z = 0, on the side `up`, +1 or -1. A point touches the
@@ -153,7 +146,6 @@ def points_on_table(
     """
     errors = np.full((len(positions), marked.shape[1]), np.nan)
     if (up * positions[0, :, 2]).max() < FLAT_HEIGHT:
-        camera = Camera("", 0, 0, intrinsics, camera_to_world)
         nodes = positions[:, :surface].astype(np.float64)
         pixels, depth = camera.project(nodes[0])
         for k, pixel in enumerate(marked[0]):

@@ -23,6 +23,7 @@ import numpy as np
 
 from neuspring.core.artifacts import Observations, Scenario, Trajectory
 from neuspring.core.errors import InputError
+from neuspring.data.camera import Camera
 from neuspring.registry import Registry
 from neuspring.scores.carried import CARRIERS, bound_positions, means, points_in_image, points_on_table
 
@@ -175,8 +176,9 @@ def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bo
     image = observations.image
     if image is None or not image.marked.shape[1]:
         return None
-    view = image.intrinsics, image.camera_to_world, positions, image.marked.astype(np.float64), observations.surface_count
-    return points_on_table(*view, 1.0 if observations.scenario.up == "+z" else -1.0) if on_table else points_in_image(*view)
+    camera = Camera("", image.width, image.height, image.intrinsics, image.camera_to_world)
+    seen = camera, positions, image.marked.astype(np.float64), observations.surface_count
+    return points_on_table(*seen, observations.scenario.up_sign) if on_table else points_in_image(*seen)
 
 
 _MM: Any = {"unit": "m", "shown_unit": "mm", "factor": 1e3, "digits": 2}

@@ -107,9 +107,13 @@ def printed(text: str, in_meters: bool = False) -> Printed:
     return Printed(text=text, value=float(text), slack=0.5 * 10.0**-digits)
 
 
+def rows_of(package: str, *path: str) -> list[dict[str, str]]:
+    """Rows of a table (CSV) that ships with a package."""
+    return list(csv.DictReader(resources.files(package).joinpath(*path).read_text(encoding="utf-8").splitlines()))
+
+
 def _rows(name: str) -> list[dict[str, str]]:
-    text = resources.files("neuspring.data").joinpath("tables", name).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
+    return rows_of("neuspring.data", "tables", name)
 
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]

@@ -15,8 +15,8 @@ from neuspring.scores.statistics import interval, resampled_means
 from neuspring.scores.table import ScoreTable, comparable
 
 ROUND_OFF = 1e-9
-NO_ESTIMATE: dict[str, Any] = dict.fromkeys(("ours", "spread", "low", "high"), np.nan) | {"scenarios": 0}
-UNCHANGED: dict[str, Any] = dict.fromkeys(("change", "change_low", "change_high", "n"), np.nan)
+NO_ESTIMATE = dict.fromkeys(("ours", "spread", "low", "high"), np.nan) | {"scenarios": 0}
+UNCHANGED = dict.fromkeys(("change", "change_low", "change_high", "n"), np.nan)
 
 
 def restricted(study: Study, table: ScoreTable) -> ScoreTable:

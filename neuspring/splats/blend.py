@@ -135,8 +135,8 @@ def kernels(real: Any) -> tuple[Any, Any]:
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
-    one = wp.constant(real(1.0))
-    half = wp.constant(real(0.5))
+    one = real(1.0)
+    half = real(0.5)
 
     def front_to_back(
         means: wp.array(dtype=vec2),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -19,7 +18,6 @@ from neuspring.splats.rasterize import Rendered, rasterize
 from neuspring.splats.view import View
 
 PLY_FORMAT = "format binary_little_endian 1.0"
-PLY_TYPE_NAMES = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 LONGEST_HEADER = 100_000
 NORMALS = ("nx", "ny", "nz")
 
@@ -50,7 +48,9 @@ class Splats(Artifact):
         parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], bands, self.opacity_logits[:, None])
         scales = np.broadcast_to(self.log_scales, self.means.shape)
         table = np.concatenate([*parts, scales, self.quaternions], axis=1).astype("<f4")
-        write_ply(Path(path), {"vertex": table.view([(name, "<f4") for name in columns])})
+        properties = [f"property float {name}" for name in columns]
+        header = "\n".join(["ply", PLY_FORMAT, f"element vertex {len(table)}", *properties, "end_header", ""])
+        write_atomically(Path(path), lambda temporary: temporary.write_bytes(header.encode() + table.tobytes()))
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -98,17 +98,6 @@ def _columns(scales: int, coefficients: int) -> list[str]:
         *(f"scale_{k}" for k in range(scales)),
         *(f"rot_{k}" for k in range(4)),
     ]
-
-
-def write_ply(path: Path, elements: Mapping[str, np.ndarray], *comments: str) -> None:
-    """Write structured arrays as the elements of a binary PLY, atomically."""
-    lines = ["ply", PLY_FORMAT, *(f"comment {comment}" for comment in comments)]
-    for name, table in elements.items():
-        kinds = [(PLY_TYPE_NAMES[table.dtype[field].str.lstrip("|")], field) for field in table.dtype.names or ()]
-        lines += [f"element {name} {len(table)}", *(f"property {kind} {field}" for kind, field in kinds)]
-    head = "\n".join([*lines, "end_header", ""]).encode()
-    content = head + b"".join(table.tobytes() for table in elements.values())
-    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 def _read_ply(path: Path) -> np.ndarray:

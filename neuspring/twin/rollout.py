@@ -25,7 +25,7 @@ class Diverged(Exception):
         self.frame, self.reason = frame, reason
 
 
-def left_scene(x: torch.Tensor, frame: int, reach: float = FAR_AWAY, what: str = "node") -> str:
+def left_scene(x: torch.Tensor, frame: int, reach: float, what: str = "node") -> str:
     """The first of the points [N, 3], m, that is farther than `reach` from the origin, in words; empty where none is."""
     # NaN compares false, so this catches it together with infinity and absurd distances.
     near = (x.abs() < reach).all(dim=1)
@@ -43,7 +43,7 @@ def frames(
     v = torch.zeros_like(x) if velocity is None else torch.tensor(velocity, dtype=x.dtype, device=x.device)
     for frame in range(1, len(hands)):
         x, v = solver.forward(x, v, hands[frame - 1], hands[frame])
-        if reason := left_scene(x, frame):
+        if reason := left_scene(x, frame, FAR_AWAY):
             raise Diverged(frame, reason)
         yield frame, x, v
 

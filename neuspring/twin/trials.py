@@ -168,8 +168,8 @@ def kernels(width: int) -> list[Any]:
     slots: Any = wp.array3d(dtype=Vector)
     targets: Any = wp.array2d(dtype=wp.vec3)
     flags: Any = wp.array2d(dtype=wp.int32)
-    far, huge = wp.constant(wp.float32(FAR_AWAY)), wp.constant(Number(*[3e38] * width))
-    half, one = wp.constant(0.5), wp.constant(1.0)
+    far, huge = wp.float32(FAR_AWAY), Number(*[3e38] * width)
+    half, one = 0.5, 1.0
 
     @wp.func
     def everywhere(p: wp.vec3) -> Vector:

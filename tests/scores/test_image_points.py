@@ -28,6 +28,9 @@ def pose() -> np.ndarray:
     return matrix
 
 
+VIEW = Camera("", 0, 0, K, pose())
+
+
 def in_world(local: np.ndarray) -> np.ndarray:
     """World points [..., 3] of points in the camera's own axes."""
     return local @ pose()[:3, :3].T + pose()[:3, 3]
@@ -50,11 +53,11 @@ def test_a_shift_parallel_to_the_image_is_exact():
     positions = in_world(sheet()[None] + shifts[:, None])
     moved = shifts[:, :2] * np.diag(K)[:2] / DEPTH
     start = marked_pixels(rng)
-    places = carried_in_image(K, pose(), positions, start, positions.shape[1])
+    places = carried_in_image(VIEW, positions, start, positions.shape[1])
     np.testing.assert_allclose(places, start + moved[:, None], atol=ROUND_OFF)
-    assert points_in_image(K, pose(), positions, start + moved[:, None], positions.shape[1]) == pytest.approx(0, abs=ROUND_OFF)
+    assert points_in_image(VIEW, positions, start + moved[:, None], positions.shape[1]) == pytest.approx(0, abs=ROUND_OFF)
     # Of a prediction that stands still the error is the shift.
-    still = points_in_image(K, pose(), np.repeat(positions[:1], 3, axis=0), start + moved[:, None], positions.shape[1])
+    still = points_in_image(VIEW, np.repeat(positions[:1], 3, axis=0), start + moved[:, None], positions.shape[1])
     assert still == pytest.approx(np.linalg.norm(moved, axis=1), abs=ROUND_OFF)
 
 
@@ -64,12 +67,12 @@ def test_nodes_on_the_other_side_and_in_the_inside_do_not_count():
     start = marked_pixels(rng)
     positions = np.stack([in_world(np.concatenate([front, back]))] * 2)
     positions[1, len(front) :] += 1.0
-    places = carried_in_image(K, pose(), positions, start, positions.shape[1])
+    places = carried_in_image(VIEW, positions, start, positions.shape[1])
     np.testing.assert_allclose(places[1], start, atol=ROUND_OFF)
     # Interior nodes come after those of the surface, here nearer to the camera.
     positions = np.stack([in_world(np.concatenate([back, front]))] * 2)
     positions[1, len(back) :] += 1.0
-    np.testing.assert_allclose(carried_in_image(K, pose(), positions, start, len(back))[1], start, atol=ROUND_OFF)
+    np.testing.assert_allclose(carried_in_image(VIEW, positions, start, len(back))[1], start, atol=ROUND_OFF)
 
 
 def test_nearer_nodes_weigh_more():
@@ -77,7 +80,7 @@ def test_nearer_nodes_weigh_more():
     positions = np.stack([in_world(local), in_world(local + np.array([[0, 0, 0], [0, 0.02, 0]]))])
     pixels, _ = Camera("", 0, 0, K, pose()).project(positions)
     start = pixels[0, :1] + [[20.0, 0]]
-    place = carried_in_image(K, pose(), positions, start, 2)[1, 0]
+    place = carried_in_image(VIEW, positions, start, 2)[1, 0]
     share = (1 / 81) / (1 / 21 + 1 / 81)
     np.testing.assert_allclose(place, start[0] + share * (pixels[1, 1] - pixels[0, 1]), atol=ROUND_OFF)
 
@@ -88,11 +91,11 @@ def test_what_is_not_marked_says_nothing():
     marked[0, :2] = [[320, 240], [330, 250]]
     marked[2, 0] = [323, 244]
     marked[2, 2] = marked[3, 2] = [300, 200]
-    errors = points_in_image(K, pose(), positions, marked, positions.shape[1])
+    errors = points_in_image(VIEW, positions, marked, positions.shape[1])
     assert errors[[0, 2]] == pytest.approx([0, 5])
     assert np.isnan(errors[[1, 3]]).all()
-    assert points_in_image(K, pose(), positions[:2], marked, positions.shape[1]).shape == (2,)
-    assert points_in_image(K, pose(), positions, np.zeros((4, 0, 2)), 10).shape == (4,)
+    assert points_in_image(VIEW, positions[:2], marked, positions.shape[1]).shape == (2,)
+    assert points_in_image(VIEW, positions, np.zeros((4, 0, 2)), 10).shape == (4,)
 
 
 def test_points_on_the_table_are_measured_on_it():
@@ -105,12 +108,12 @@ def test_points_on_the_table_are_measured_on_it():
     positions = np.stack([nodes, nodes + shift, nodes + np.array([0, 0, 0.1])])
     start = view.project(np.array([[0.031, 0.012, 0.002], [-0.05, 0.04, 0.002]]))[0]
     marked = np.stack([start] * 3)
-    found = points_on_table(K, view.camera_to_world, positions, marked, len(nodes), 1.0)
+    found = points_on_table(view, positions, marked, len(nodes), 1.0)
     assert found[:2] == pytest.approx([0.0, np.linalg.norm(shift)], abs=1e-9)
     assert np.isnan(found[2])
     # A thing that is high in frame 0 is not flat.
     high = np.concatenate([positions, positions[:, :1] + np.array([0, 0, 0.05])], axis=1)
-    assert np.isnan(points_on_table(K, view.camera_to_world, high, marked, len(nodes), 1.0)).all()
+    assert np.isnan(points_on_table(view, high, marked, len(nodes), 1.0)).all()
 
 
 def test_scores_of_color_alone_have_the_errors_of_marked_points():

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from neuspring.cli.options import Host, NoOpen, Port, Positional, arg
+from neuspring.cli.options import Positional, arg
 
 
 def annotate(
     capture: Annotated[Positional[Path], arg(help="folder with capture.json")],
-    host: Host = "127.0.0.1",
-    port: Port = 8765,
-    no_open: NoOpen = False,
+    host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
+    port: Annotated[int, arg(help="0: any that is free")] = 8765,
+    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
 ) -> None:
     """Mark object, controllers and person of a capture in the browser; serves until Ctrl-C."""
     from neuspring.core.web import is_loopback, open_page

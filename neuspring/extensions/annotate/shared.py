@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Lock, Thread
 from time import monotonic
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeVar
 
 from neuspring.core.errors import InputError, NumericalFailure
 
@@ -45,7 +45,7 @@ class Document(Generic[T]):
         return hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] if self.path.exists() else "none"
 
 
-Report: TypeAlias = Callable[[str, int, int], None]
+Report = Callable[[str, int, int], None]
 """Progress of work, as it calls it: (what, done, of all). Raises Stopped when the user stopped the work."""
 
 
@@ -57,7 +57,7 @@ class Busy(Exception):
     """Other work has not ended."""
 
 
-IDLE: dict[str, Any] = {"state": "idle", "what": "", "done": 0, "total": 0, "seconds": 0.0, "message": ""}
+IDLE = {"state": "idle", "what": "", "done": 0, "total": 0, "seconds": 0.0, "message": ""}
 """State of a job: idle, running, done, failed or stopped; what it does, how far it is, and what it says at the end."""
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -42,7 +41,7 @@ DISTANCE_CELL = 4
 """Side of the cells of the distance from object and hands, pixels."""
 HIDDEN_STRIDE = 3
 """Stride among the object's pixels beneath hands: each third gets a point."""
-SeenHands: TypeAlias = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, float]]
+SeenHands = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, float]]
 """Entries of ImageObservations about hands, the pixels of each grip, and facts."""
 
 

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 from typing import Annotated
 
-from neuspring.cli.options import Host, NoOpen, Port, Positional, arg
+from neuspring.cli.options import Positional, arg
 from neuspring.core.errors import InputError
 
 
@@ -15,10 +15,10 @@ def play(
         Positional[tuple[Path, ...]],
         arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario; the sample twin by default"),
     ] = (),
-    host: Host = "127.0.0.1",
-    port: Port = 8080,
+    host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
+    port: Annotated[int, arg(help="0: any that is free")] = 8080,
     frame: Annotated[int, arg(help="frame to begin with")] = 0,
-    no_open: NoOpen = False,
+    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
 ) -> None:
     """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
     from neuspring.core.web import is_loopback, open_page

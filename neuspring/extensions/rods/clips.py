@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,7 +21,7 @@ from neuspring.draw.sheet import save
 from neuspring.extensions.rods.metric import DEFORM_L1
 from neuspring.report.blocks import Items
 from neuspring.scores.metrics import DASH
-from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed
+from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed, rows_of
 from neuspring.scores.table import DAMAGED, ScoreTable, collect, read_transfers
 
 EUCLID = "track_error"
@@ -54,12 +52,11 @@ class PublishedError(Printed):
 
 def published() -> Values:
     """PublishedError errors on DEFORM's cables, mm, by label of the row, cable, metric."""
-    text = resources.files("neuspring.extensions.rods").joinpath("deform_published.csv").read_text(encoding="utf-8")
     return {
         (row["method"], row["cable"], DEFORM_L1.name): PublishedError(
             **vars(printed(row["l1_mm"])), source=row["source"], tag=row["tag"]
         )
-        for row in csv.DictReader(text.splitlines())
+        for row in rows_of("neuspring.extensions.rods", "deform_published.csv")
     }
 
 

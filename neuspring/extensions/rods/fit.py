@@ -68,9 +68,9 @@ VARIABLE_SCALES = {
 }  # fmt: skip
 """Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
 LOGARITHMIC = (
-    *("bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots"),
-    *("slip_share", "slip_yield", "slip_twist"),
-)
+    "bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots", "slip_share", "slip_yield",
+    "slip_twist",
+)  # fmt: skip
 SLIP_SHARE, SLIP_ANGLES = 0.3, (0.02, 3.0)
 """Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
 SLIP_DAMPING = 0.02

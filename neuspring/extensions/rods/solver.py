@@ -30,25 +30,25 @@ from neuspring.core.artifacts import Simulation
 from neuspring.core.device import load
 from neuspring.extensions.rods.rod import Rod
 
-TWIST_STEPS = wp.constant(60)
+TWIST_STEPS = 60
 """Newton steps of the twist in frame 0, where it starts from an even one, at most."""
-MAX_TURN = wp.constant(wp.float64(0.5))
+MAX_TURN = wp.float64(0.5)
 """Largest change of an angle in a step of Newton, rad."""
-LEAST_PIVOT = wp.constant(wp.float64(1e-3))
+LEAST_PIVOT = wp.float64(1e-3)
 """Least pivot of the matrix of the steps in frame 0, over the entry of the diagonal."""
-TINY = wp.constant(wp.float64(1e-12))
-BAND_WIDTH = wp.constant(11)
+TINY = wp.float64(1e-12)
+BAND_WIDTH = 11
 """Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
-JOINT = wp.constant(11)
+JOINT = 11
 """Variables that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
-FREE_TURN_STIFFNESS = wp.constant(wp.float64(1e-9))
+FREE_TURN_STIFFNESS = wp.float64(1e-9)
 """Fraction of GJ / l: stiffness against turning of a rod that nothing else turns."""
 
 real = wp.float64
 vec3 = wp.vec3d
 vec2 = wp.vec2d
 mat33 = wp.mat33d
-Row: Any = wp.types.vector(length=11, dtype=wp.float64)
+Row = wp.types.vector(length=11, dtype=wp.float64)
 Scalars: Any = wp.array2d(dtype=real)
 Vectors: Any = wp.array2d(dtype=vec3)
 Pairs: Any = wp.array2d(dtype=vec2)

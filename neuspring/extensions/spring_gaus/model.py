@@ -66,22 +66,17 @@ class SpringGausModel(AnchorGraph, AnchorPhysics):
     bound_anchors: int
 
     @classmethod
-    def start(
-        cls, graph: AnchorGraph, settings: SpringGausTraining, *, frame_time: float, up_sign: float, gravity: float, ground: bool
-    ) -> SpringGausModel:
+    def start(cls, graph: AnchorGraph, physics: AnchorPhysics, settings: SpringGausTraining) -> SpringGausModel:
         """Before training: a homogeneous body at rest."""
         return cls(
             **vars(graph),
+            **vars(physics),
             kappa=np.full(len(graph.anchors), np.log10(settings.stiffness)),
             soft=np.zeros(1),
             theta=np.full(1, np.exp(settings.damping)),
             rho=np.full(1, GROUND_LOGIT),
             velocity=np.zeros(3),
             substeps=settings.substeps,
-            frame_time=frame_time,
-            up_sign=up_sign,
-            gravity=gravity,
-            ground=ground,
             full_neighbors=settings.full_neighbors,
             bound_anchors=BOUND_ANCHORS,
         )

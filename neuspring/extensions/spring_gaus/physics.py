@@ -134,8 +134,8 @@ class AnchorKernels(NamedTuple):
 def kernels(real: Any) -> AnchorKernels:
     """Kernels for the scalar type `real`, wp.float32 or wp.float64."""
     vec3 = wp.types.vector(3, real)
-    slack, floor = wp.constant(real(SLACK)), wp.constant(real(MIN_ANCHOR_LENGTH))
-    zero, one = wp.constant(real(0.0)), wp.constant(real(1.0))
+    slack, floor = real(SLACK), real(MIN_ANCHOR_LENGTH)
+    zero, one = real(0.0), real(1.0)
 
     @wp.struct
     class State:

@@ -32,7 +32,7 @@ from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.results import masks_of_cameras
 from neuspring.extensions.spring_gaus.baseline import find_vgg16
 from neuspring.extensions.spring_gaus.model import Follower, SpringGausModel, SpringGausTraining, choose_anchors
-from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorPhysics, AnchorSolver
 from neuspring.scores.lpips import read_layers
 from neuspring.splats.draw import view_of
 from neuspring.splats.losses import ssim
@@ -89,8 +89,13 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
     anchors = choose_anchors(cloud, chosen.anchors, np.random.default_rng(request.seed))
     hands = observations.controller_points[: scenario.train_end]
     graph = AnchorGraph.between(anchors, hands[0], chosen.neighbors)
-    world = {"frame_time": 1 / scenario.frame_rate, "up_sign": scenario.up_sign, "gravity": settings.simulation.gravity}
-    start = SpringGausModel.start(graph, chosen, ground=scenario.ground, **world)
+    physics = AnchorPhysics(
+        frame_time=1 / scenario.frame_rate,
+        gravity=settings.simulation.gravity,
+        up_sign=scenario.up_sign,
+        ground=scenario.ground,
+    )
+    start = SpringGausModel.start(graph, physics, chosen)
     follower = Follower(cloud, start.anchors, start.bound_anchors, device)
     facts: dict[str, Any] = {"anchors": len(anchors), "links": len(graph.links)}
     if pictures and splats:

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from neuspring.extensions.synthetic.meshes import block, boundary, embed, fill, stick
 from neuspring.scenes.shapes import Sdf, capsule, ellipsoid, smooth_union, sphere, surface
 
-NO_TETRAHEDRA = np.zeros((0, 4), dtype=int)
-NO_TRIANGLES = np.zeros((0, 3), dtype=int)
+
+def _empty(*shape: int) -> Any:
+    """A field that is an empty array by default; of indices if it has columns."""
+    return field(default_factory=lambda: np.zeros(shape, int if len(shape) > 1 else float))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,21 +51,21 @@ class SoftBody:
     surface: Surface
     radius: float
     """Contact radius of a node, m."""
-    tetrahedra: np.ndarray = field(default_factory=lambda: NO_TETRAHEDRA)
+    tetrahedra: np.ndarray = _empty(0, 4)
     """[E, 4]."""
-    youngs_modulus: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    youngs_modulus: np.ndarray = _empty(0)
     """[E], Pa."""
-    poisson_ratio: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    poisson_ratio: np.ndarray = _empty(0)
     """[E]."""
-    density: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    density: np.ndarray = _empty(0)
     """[E], kg/m^3."""
-    triangles: np.ndarray = field(default_factory=lambda: NO_TRIANGLES)
+    triangles: np.ndarray = _empty(0, 3)
     """[M, 3]: the sheet, or the fabric skin of a solid."""
-    membrane: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    membrane: np.ndarray = _empty(0)
     """[M], N/m: in-plane stiffness of triangles."""
     sheet_density: float = 0.0
     """kg/m^2; zero for skins, whose mass is in the solid."""
-    bending: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    bending: np.ndarray = _empty(0)
     """[N], N m: bending stiffness of a sheet around each node (its edges take the mean of their ends)."""
     air_drag: float = 0.0
     """Aerodynamic drag of triangles."""

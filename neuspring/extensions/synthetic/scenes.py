@@ -114,10 +114,10 @@ def nearest(nodes: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
     return np.asarray(nodes[np.argmin((((nodes - low) / np.maximum(high - low, 1e-9) - np.asarray(wanted)) ** 2).sum(axis=1))])
 
 
-LIFT: Offsets = ((0, 0, 0.16), (-0.05, 0.06, 0.18), (0.04, -0.06, 0.14), (0, 0.03, 0.2), (0.03, 0.02, 0.09), (0, 0, 0.03))
-TOGETHER: Offsets = ((0, 0, 0.14), (-0.015, 0.06, 0.17), (0.015, -0.06, 0.13), (0, 0.03, 0.18), (0.01, 0.02, 0.08), (0, 0, 0.03))
+LIFT = ((0, 0, 0.16), (-0.05, 0.06, 0.18), (0.04, -0.06, 0.14), (0, 0.03, 0.2), (0.03, 0.02, 0.09), (0, 0, 0.03))
+TOGETHER = ((0, 0, 0.14), (-0.015, 0.06, 0.17), (0.015, -0.06, 0.13), (0, 0.03, 0.18), (0.01, 0.02, 0.08), (0, 0, 0.03))
 """Two hands at the ends of one animal must not crush it."""
-LOW_LIFT: Offsets = ((0, 0, 0.1), (-0.03, 0.05, 0.11), (0.03, -0.04, 0.06), (0, 0, 0.12))
+LOW_LIFT = ((0, 0, 0.1), (-0.03, 0.05, 0.11), (0.03, -0.04, 0.06), (0, 0, 0.12))
 
 
 def lift(*places: Sequence[float], reach: float = 0.02, offsets: Offsets = LIFT, turn: Sequence[float] = (0, 0, 0)) -> Callable:
@@ -180,7 +180,7 @@ def _package(spacing: float, skin: float) -> SoftBody:
 
 
 GRIPPED_CORNER, OTHER_CORNER, GRIPPED_MIDDLE = (1.0, 0.0, 0.5), (1.0, 1.0, 0.5), (0.5, 0.5, 0.5)
-SCENES: dict[str, SyntheticScene] = {
+SCENES = {
     "double_lift_cloth_1": SyntheticScene(_cloth("napkin"), 116, lift(GRIPPED_CORNER, OTHER_CORNER)),
     "double_lift_cloth_3": SyntheticScene(_cloth("scarf"), 118, lift(GRIPPED_CORNER, OTHER_CORNER)),
     "single_clift_cloth_1": SyntheticScene(_cloth("napkin"), 80, lift(GRIPPED_MIDDLE)),

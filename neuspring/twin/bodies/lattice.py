@@ -101,14 +101,9 @@ and it goes on for the rest of dt.
 
         return solver_for(twin, device, differentiable=False)
 
-    def check(self, twin: Twin) -> None:
-        stability.check(twin)
-
-    def stable(self, twin: Twin, safety: float) -> Twin:
-        return stability.stable(twin, safety)
-
-    def for_prediction(self, twin: Twin) -> Twin:
-        return stability.for_prediction(twin)
+    check = staticmethod(stability.check)
+    stable = staticmethod(stability.stable)
+    for_prediction = staticmethod(stability.for_prediction)
 
     def load(self, twin: Twin) -> float:
         return stability.twin_spectrum(twin).load(twin.simulation.substep)

@@ -12,7 +12,7 @@ import torch
 
 from neuspring.core.device import resolve_device
 from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
-from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorSolver, reference_substep
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorPhysics, AnchorSolver, reference_substep
 from results.published.bench.simulators import take_turns
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
@@ -43,7 +43,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
     hands = np.stack([anchors[:30] + 0.005, anchors[:30] + 0.01]).astype(np.float32)
     settings = SpringGausTraining()
     graph = AnchorGraph.between(anchors, hands[0], settings.neighbors)
-    model = SpringGausModel.start(graph, settings, frame_time=1 / 30, up_sign=1.0, gravity=9.8, ground=True)
+    model = SpringGausModel.start(graph, AnchorPhysics(frame_time=1 / 30), settings)
     return model, hands
 
 

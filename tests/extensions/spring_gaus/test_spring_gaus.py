@@ -41,7 +41,7 @@ def bar(height=0.3, seed=0):
 def model_of(anchors, controllers, settings=SMALL, **changed):
     graph = AnchorGraph.between(anchors, controllers, settings.neighbors)
     world = {"frame_time": FRAME, "up_sign": 1.0, "gravity": 9.8, "ground": True} | changed
-    return replace(SpringGausModel.start(graph, settings, **world), link_stiffness=3e3)
+    return SpringGausModel.start(graph, AnchorPhysics(**world, link_stiffness=3e3), settings)
 
 
 def test_the_soft_vector_at_its_start():

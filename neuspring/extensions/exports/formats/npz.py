@@ -29,7 +29,7 @@ SIZE_MEANINGS = {
     "A": "1 (isotropic) or 3",
     "K": "coefficients of spherical harmonics per channel: 1, 4, 9 or 16",
 }
-EXPORTED_SETTINGS: dict[str, tuple[str, str]] = {
+EXPORTED_SETTINGS = {
     "frame_time": ("s", "simulated time per frame"),
     "substeps": ("1", "steps per frame"),
     "gravity": ("m/s^2", "acceleration downwards"),
@@ -41,7 +41,7 @@ EXPORTED_SETTINGS: dict[str, tuple[str, str]] = {
 EXPORTED_SETTINGS |= {
     spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in dataclasses.fields(Material) if spec.name in SCALARS
 }
-MOTION: dict[str, tuple[str, str, str]] = {
+MOTION = {
     "frame": ("F", "1", "number of the frame; frame 0 is where the motion starts"),
     "time": ("F", "s", "since frame 0"),
     "positions": ("F,N,3", "m", "predicted nodes"),

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from neuspring.core.files import write_atomically
 from neuspring.extensions.exports import Export
 from neuspring.extensions.exports.source import ExportSource
-from neuspring.splats.model import Splats, write_ply
+from neuspring.splats.model import Splats
 from neuspring.twin.body import lines_of
 
 VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("mass", "<f4"), ("region", "<i4"), ("controller", "u1"), ("stiffness", "<f4")]
 EDGE_DTYPE = [("vertex1", "<i4"), ("vertex2", "<i4")]
 EDGE_DTYPE += [(name, "<f4") for name in ("stiffness", "dashpot", "rest_length", "strain")]
+PLY_TYPE_NAMES = {"<f4": "float", "<i4": "int", "u1": "uchar"}
 COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
 
 
@@ -24,7 +26,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     made = []
     for frame in frames:
         made.append(output / f"springs_{frame:05d}.ply")
-        write_ply(made[-1], {"vertex": vertices(source, frame), "edge": edges(source, frame)}, COMMENT)
+        _write_elements(made[-1], {"vertex": vertices(source, frame), "edge": edges(source, frame)})
     if source.splats is not None:
         for frame, splats in source.moved_splats(frames):
             made.append(output / f"splats_{frame:05d}.ply")
@@ -68,6 +70,16 @@ def edges(source: ExportSource, frame: int) -> np.ndarray:
     ends = points(source, frame)[lines.pairs]
     table["strain"] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / lines.rest_lengths - 1
     return table
+
+
+def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT}"]
+    for name, table in elements.items():
+        lines.append(f"element {name} {len(table)}")
+        lines += [f"property {PLY_TYPE_NAMES[table.dtype[field].str.lstrip('|')]} {field}" for field in table.dtype.names or ()]
+    head = "\n".join([*lines, "end_header", ""]).encode()
+    content = head + b"".join(table.tobytes() for table in elements.values())
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 export = Export(write=write, frames="0")
