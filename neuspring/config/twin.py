@@ -91,9 +91,11 @@ class Fit(SettingsSection):
     """Clamp of the stiffness inside the simulation, N."""
     damping: Literal["fixed", "homogeneous"] = "fixed"
     """Training of the damping: none (fixed), or drag and one factor of all dashpots (homogeneous)."""
-    selection: Literal["training_loss", "tail"] = "training_loss"
-    """Loss that chooses the best epoch: that seen while training, as in the paper, or that on a tail of training frames. On a tail,
-    the last fifth, nothing is fitted; the start of the fit is a candidate too."""
+    plateau: NonNegative = 0.01
+    """Relative decrease of the loss of rollouts, in 20 epochs, below which the fit has converged and ends. 0: all epochs."""
+    selection: Literal["rollout", "tail", "training_loss"] = "rollout"
+    """Loss that chooses the twin: of its rollout over the training frames, or over the last fifth of them, on which nothing is
+    fitted then; the search's twin is a candidate. training_loss: the mean seen while training, as in the released code."""
     field: SpringFieldSettings = dataclasses.field(default_factory=SpringFieldSettings)
 
     def __post_init__(self) -> None:

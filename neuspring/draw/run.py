@@ -28,7 +28,7 @@ FROM_ABOVE = 75.0
 """Elevation of the second view of a twin, degrees."""
 DIVERGED_COST = 1e3
 """Costs above this are of candidates that could not be simulated."""
-SERIES = {"best_cost": "best cost so far", "loss": "loss", "tail_loss": "loss of held-back frames"}
+SERIES = {"best_cost": "best cost so far", "loss": "loss", "rollout_loss": "loss of rollouts"}
 """Metrics of histories that are drawn, and their labels."""
 
 

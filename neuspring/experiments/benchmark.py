@@ -298,7 +298,7 @@ class Benchmark:
             raise InputError(f"method {name}, fit", rule, method.fit)
         if method.oracle and config.fit.selection == "tail":
             rule = "an oracle is fitted on all frames and holds none back"
-            raise InputError(f"method {name}, fit.selection", rule, "tail", "Use training_loss.")
+            raise InputError(f"method {name}, fit.selection", rule, "tail", "Use rollout.")
         low, high = config.fit.stiffness_range
         if not low <= wanted.low < wanted.high <= high:
             rule = f"must hold the search's range of {wanted.low} to {wanted.high}, or springs start beyond their clamp"

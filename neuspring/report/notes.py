@@ -27,7 +27,12 @@ def of_runs(runs: Iterable[RunRecord]) -> list[tuple[str, Finding]]:
         of_rods = "fit.result.vertices" in facts or "search.result.vertices" in facts
         cases = [
             (bool(ends), "search at an end of its range", ends, f"Widen search.variables for {ends}."),
-            (facts.get("fit.result.best_epoch", 1) <= 0, "training improved nothing", "best epoch 0", "Lower fit.learning_rate."),
+            (
+                facts.get("fit.result.best_epoch", 1) < 0,
+                "training improved nothing",
+                "none",
+                "Lower fit.learning_rate.",
+            ),
             (
                 springs is not None and springs == inner and not of_rods,
                 "no spring joins a controller to the object",

@@ -2,10 +2,11 @@
 
 An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the whole
 training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the
-state is detached there and goes on while parameters change. The best epoch is the one with the lowest training loss, or the lowest
-loss of a held-back tail of the training frames, to which the start counts too. Test frames are never read, but by an oracle
-(`FitProblem.oracle`). A non-finite loss or gradient restores the parameters of the epoch's start, halves the learning rates and is
-reported.
+state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every CHECK_EVERY epochs a
+rollout of the parameters from rest gives the loss of a twin. The twin with the lowest is the result, the start among them: no fit
+ends behind its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends when
+they have stopped falling. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient
+restores the parameters of the epoch's start, halves the learning rates and is reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
 is recorded is in m^2.
@@ -52,6 +53,10 @@ ADJOINT_LIMIT = 100.0
 ends (`solver.AdjointLimit`)."""
 TAIL_FRACTION = 0.2
 """Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
+CHECK_EVERY = 5
+"""Epochs between two rollouts. All fits that share launches make theirs together."""
+PLATEAU_EPOCHS = 20
+"""Epochs in which the lowest loss of rollouts must fall by `fit.plateau`, else the fit has converged."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -90,7 +95,7 @@ class FitProblem:
         if self.kind not in body.fits:
             raise InputError("fit, kind", f"a {body.name} is fitted as {' or '.join(body.fits)}", self.kind)
         if self.oracle and self.fit.selection == "tail":
-            raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use training_loss.")
+            raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use rollout.")
 
     @property
     def frame_end(self) -> int:
@@ -105,10 +110,11 @@ class FitProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class FitResult(Learned):
-    """The best twin, and the history: one row per epoch (epoch, loss, tail_loss, gradient_norm, rolled_back, learning_rate).
+    """The best twin, and the history: one row per epoch (epoch, loss, rollout_loss, gradient_norm, rolled_back, learning_rate).
 
     Gradients are those of the loss in its unit (`fit.loss_unit`). Facts: best_epoch, whose end is the result (-1: the start);
-    best_loss, the training loss or tail loss that selected it, m^2; rollbacks; what moved and what was in the way (`movement`).
+    rollout_loss, m^2, of the result, running_loss, the mean of its epoch, and search_loss, of the start's rollout; converged;
+    rollbacks; what moved and what was in the way (`movement`).
     """
 
     history: pd.DataFrame
@@ -119,9 +125,9 @@ class FitResult(Learned):
         return int(self.facts["best_epoch"])
 
     @property
-    def best_loss(self) -> float:
-        """Training loss or tail loss that selected it, m^2."""
-        return float(self.facts["best_loss"])
+    def rollout_loss(self) -> float:
+        """Mean loss of the result's rollout, m^2, over the frames that are trained on, or the held-back tail."""
+        return float(self.facts["rollout_loss"])
 
 
 @dataclass
@@ -132,6 +138,7 @@ class _State:
     moments: dict[str, np.ndarray]
     rate: float
     rollbacks: list[str]
+    search_loss: float
     best_epoch: int
     best_loss: float
     best_values: dict[str, np.ndarray]
@@ -194,9 +201,9 @@ class FitRecording:
         return self.source.twin
 
     @property
-    def tail(self) -> range:
-        """The held-back frames."""
-        return range(self.fitted_end, len(self.hands))
+    def judged(self) -> range:
+        """The frames by which twins are chosen: the held-back tail, or without one those that are trained on."""
+        return range(self.fitted_end if self.fitted_end < len(self.hands) else 1, len(self.hands))
 
     def use_substeps(self, count: int) -> None:
         """Integrate with `count` substeps per frame from now on."""
@@ -296,12 +303,6 @@ class TwinFit:
         return self.recordings[0].twin
 
     @property
-    def one_step(self) -> bool:
-        """True where an epoch is a single optimizer step, so that its losses belong to the values before it."""
-        first = self.recordings[0]
-        return len(self.recordings) == 1 and first.horizon >= first.fitted_end - 1
-
-    @property
     def collision_overflow(self) -> int:
         """Collision candidates that did not fit the list, summed over all solvers so far."""
         return sum(one.source.collision_overflow for one in self.recordings)
@@ -325,13 +326,13 @@ class TwinFit:
     def epoch(self) -> Generator[Any, Any, dict[str, float]]:
         """One pass over the frames that are trained on, each recording in turn. Raises NonFinite.
 
-        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step;
-        `frames_left_out` of gradients; and, if frames are held back and the epoch is one step, their `tail_loss` before it.
+        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and
+        `frames_left_out` of gradients.
         """
         rows = []
         for one in self.recordings:
             rows.append((yield from self._pass(one)))
-        return rows[0] | {
+        return {
             "loss": sum(row["loss"] for row in rows) / len(rows),
             "gradient_norm": max(row["gradient_norm"] for row in rows),
             "frames_left_out": sum(row["frames_left_out"] for row in rows),
@@ -339,7 +340,7 @@ class TwinFit:
 
     def _pass(self, recording: FitRecording) -> Generator[Any, Any, dict[str, float]]:
         state, end, horizon = recording.rest, recording.fitted_end, recording.horizon
-        total, largest, left_out, row = 0.0, 0.0, 0, {}
+        total, largest, left_out = 0.0, 0.0, 0
         for start in range(1, end, horizon):
             window = range(start, min(start + horizon, end))
             packed = recording.stable(self.parameters)
@@ -355,28 +356,21 @@ class TwinFit:
             total += float(mean.detach()) * len(window)
             x, v, lengths = state
             state = (x.detach(), v.detach(), None if lengths is None else lengths.detach())
-            if self.one_step and recording.tail:
-                values = {name: value.detach() for name, value in packed.items()}
-                _, tail = yield from recording.simulate(state, recording.tail, values)
-                row["tail_loss"] = float(tail.detach())
             largest = max(largest, self._step(window, gradients))
-        return row | {"loss": total / (end - 1), "gradient_norm": largest, "frames_left_out": left_out}
+        return {"loss": total / (end - 1), "gradient_norm": largest, "frames_left_out": left_out}
 
-    def tail_loss(self) -> Generator[Any, Any, float]:
-        """Mean loss of the held-back frames of all recordings, m^2, in rollouts from rest with the present values.
-
-        Raises NonFinite.
-        """
+    def rollout_loss(self) -> Generator[Any, Any, float]:
+        """Mean loss of the judged frames of all recordings, m^2, in rollouts of the present values. Raises NonFinite."""
         losses = []
         for one in self.recordings:
             packed = {name: value.detach() for name, value in one.stable(self.parameters).items()}
             state = one.rest
-            for frame in range(1, one.fitted_end):
+            for frame in range(1, one.judged.start):
                 state = yield from one.frame(state, frame, packed)
-            _, mean = yield from one.simulate(state, one.tail, packed)
+            _, mean = yield from one.simulate(state, one.judged, packed)
             losses.append(float(mean.detach()))
             if not math.isfinite(losses[-1]):
-                raise NonFinite("the loss of the held-back frames is not finite")
+                raise NonFinite("the loss of a rollout is not finite")
         return sum(losses) / len(losses)
 
     def _step(self, window: range, gradients: Sequence[torch.Tensor | None]) -> float:
@@ -435,9 +429,9 @@ def fit_many(tasks: Sequence[FitTask], most: int = 0) -> list[FitResult | Except
     return results
 
 
-def start_tail_loss(problem: FitProblem) -> float:
-    """The loss of the held-back frames before any epoch, m^2. Raises NonFinite."""
-    loss: float = result_of(lockstep([TwinFit(problem).tail_loss()], SharedFrames().serve))
+def start_loss(problem: FitProblem) -> float:
+    """The loss of a rollout before any epoch, m^2. Raises NonFinite."""
+    loss: float = result_of(lockstep([TwinFit(problem).rollout_loss()], SharedFrames().serve))
     return loss
 
 
@@ -454,7 +448,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
     for epoch in loop:
-        if len(state.rollbacks) >= MAX_ROLLBACKS:
+        if len(state.rollbacks) >= MAX_ROLLBACKS or converged(loop.history, state.search_loss, problem.fit.plateau):
             break
         row = yield from _advance(run, state, problem, epoch)
         state.overflow = overflow + run.collision_overflow
@@ -465,6 +459,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
     run.parameters.restore(state.best_values)
     run.use_substeps(state.best_substeps)
+    rollout_loss = yield from run.rollout_loss()
     best = run.parameters.as_twin(run.twin)
     history, figures = pd.DataFrame(loop.history), movement(run.parameters)
     if state.gradient_over_epsilon is not None:
@@ -472,7 +467,10 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     frames, counts = problem.frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
-        "best_loss": state.best_loss,
+        "search_loss": state.search_loss,
+        "running_loss": loop.history[state.best_epoch]["loss"] if state.best_epoch >= 0 else None,
+        "rollout_loss": rollout_loss,
+        "converged": converged(loop.history, state.search_loss, problem.fit.plateau),
         "epochs": len(history),
         "epochs_asked": problem.fit.epochs,
         "rollbacks": state.rollbacks,
@@ -485,7 +483,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     return FitResult(
         twin=best,
         history=history,
-        course=history.set_index("epoch")[["loss", "tail_loss", "gradient_norm", "learning_rate"]],
+        course=history.set_index("epoch")[["loss", "rollout_loss", "gradient_norm", "learning_rate"]],
         facts=facts,
         attempts=loop.attempts,
         earlier_seconds=loop.earlier_seconds,
@@ -495,12 +493,26 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
 def _start(run: TwinFit, problem: FitProblem) -> Generator[Any, Any, _State]:
     """The state before the first epoch."""
     values, substeps = run.parameters.copy(), problem.twin.simulation.substeps
-    state = _State(values, {}, 1.0, [], -1, math.inf, values, substeps, substeps)
-    if problem.fit.selection == "tail" and not run.one_step:
-        # A start that cannot be simulated does not win; if no epoch can be completed either, `fit` says so.
-        with contextlib.suppress(NonFinite):
-            state.best_loss = yield from run.tail_loss()
-    return state
+    loss = math.inf
+    # A start that cannot be simulated does not win; if no epoch can be completed either, `fit` says so.
+    with contextlib.suppress(NonFinite):
+        loss = yield from run.rollout_loss()
+    best = math.inf if problem.fit.selection == "training_loss" else loss
+    return _State(values, {}, 1.0, [], loss, -1, best, values, substeps, substeps)
+
+
+def converged(history: Sequence[Mapping[str, Any]], start: float, plateau: float) -> bool:
+    """True where the lowest loss of rollouts has fallen by less than a fraction `plateau` in the last PLATEAU_EPOCHS epochs.
+
+    `start` is the loss before the first epoch.
+    """
+
+    def lowest(rows: Sequence[Mapping[str, Any]]) -> float:
+        return min([start, *(row["rollout_loss"] for row in rows if row["rollout_loss"] is not None)])
+
+    before = history[:-PLATEAU_EPOCHS]
+    due = len(history) >= PLATEAU_EPOCHS and len(history) % CHECK_EVERY == 0
+    return plateau > 0 and due and lowest(history) > (1 - plateau) * lowest(before)
 
 
 def _growth(values: np.ndarray, reference: np.ndarray) -> float:
@@ -514,26 +526,26 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
 
     Accepted values can always be integrated with `state.substeps`.
     """
-    row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "tail_loss": None, "gradient_norm": None}
+    row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "rollout_loss": None, "gradient_norm": None}
     row["frames_left_out"] = 0
     run.set_rate(state.rate)
     row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
-        before = (state.values, state.substeps)
         run.gradients = [] if state.gradient_over_epsilon is None else None
         losses = yield from run.epoch()
         run.require_stable()
         if run.gradients and (median := float(np.median(run.gradients))):
             state.gradient_over_epsilon = median / problem.fit.epsilon
-        if problem.fit.selection == "tail" and not run.one_step:
-            losses["tail_loss"] = yield from run.tail_loss()
+        released = problem.fit.selection == "training_loss"
+        if not released and ((epoch + 1) % CHECK_EVERY == 0 or epoch == problem.fit.epochs - 1):
+            losses["rollout_loss"] = yield from run.rollout_loss()
         state.values, state.moments = run.parameters.copy(), adam_arrays(run.optimizer)
         state.substeps = run.twin.simulation.substeps
         row |= losses
-        loss = losses["tail_loss" if problem.fit.selection == "tail" else "loss"]
+        loss = losses["loss"] if released else losses.get("rollout_loss", math.inf)
         if eligible(epoch, problem) and loss < state.best_loss:
-            state.best_loss, state.best_epoch = loss, epoch - run.one_step
-            state.best_values, state.best_substeps = before if run.one_step else (state.values, state.substeps)
+            state.best_loss, state.best_epoch = loss, epoch
+            state.best_values, state.best_substeps = state.values, state.substeps
     except NonFinite as failure:
         state.rollbacks.append(f"epoch {epoch}: {failure}")
         print(f"rolled back: {state.rollbacks[-1]}; the learning rates are halved")

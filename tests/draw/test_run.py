@@ -22,7 +22,7 @@ HISTORIES = {
         {"step": [0, 1, 0, 1], "metric": ["cost", "cost", "best_cost", "best_cost"], "value": [2e-3, 1e6, 2e-3, 2e-3]}
     ),
     "fit": pd.DataFrame(
-        {"step": [0, 1, 0, 1], "metric": ["loss", "loss", "tail_loss", "tail_loss"], "value": [4e-3, 1e-4, 5e-3, 3e-3]}
+        {"step": [0, 1, 0, 1], "metric": ["loss", "loss", "rollout_loss", "rollout_loss"], "value": [4e-3, 1e-4, 5e-3, 3e-3]}
     ),
 }
 NAMES = {"errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png"}

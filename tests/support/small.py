@@ -144,7 +144,7 @@ def assert_same_fit(got: FitResult | Exception, wanted: FitResult) -> None:
     """Equal histories and twins, bit for bit."""
     assert isinstance(got, FitResult), got
     pd.testing.assert_frame_equal(got.history, wanted.history, check_exact=True)
-    for name in ("best_epoch", "best_loss", "rollbacks"):
+    for name in ("best_epoch", "rollout_loss", "rollbacks"):
         assert got.facts[name] == wanted.facts[name]
     assert got.twin.simulation == wanted.twin.simulation
     for part in ("topology", "material"):

@@ -142,7 +142,9 @@ def test_a_non_finite_gradient_rolls_back_and_is_reported(monkeypatch):
         nonlocal calls
         calls += 1
         x, v = real(*arguments)
-        return (x * float("nan"), v) if calls == 7 else (x, v)  # in the second epoch: 4 training frames each
+        return (
+            (x * float("nan"), v) if calls == 11 else (x, v)
+        )  # in the second epoch: 4 training frames each, after the rollout of the start
 
     monkeypatch.setattr(batch, "simulate_frame", poisoned)
     result = fit(problem)
@@ -175,7 +177,7 @@ def test_frames_beyond_the_limit_of_adjoints_are_left_out_and_counted(limit, hor
 @pytest.mark.parametrize("kind", ["springs", "field"])
 def test_substeps_grow_within_an_epoch(kind):
     """One epoch of four steps, so long that the last frames could not be integrated with the first substeps."""
-    settings = field_fit(epochs=1, learning_rate={"springs": 0.5, "field": 0.05}[kind])
+    settings = field_fit(epochs=1, learning_rate={"springs": 0.5, "field": 0.05}[kind], selection="training_loss")
     problem = small.fit_problem(fit=settings, kind=kind)
     result = fit(problem)
     assert result.facts["rollbacks"] == []
@@ -244,38 +246,53 @@ def loss_of(twin: Twin, seen: Observations, frames: range) -> float:
     return float(torch.stack([loss(frame, positions[frame]) for frame in frames]).mean())
 
 
-@pytest.mark.parametrize("horizon", [1, 0])
 @pytest.mark.parametrize("kind", ["springs", "field"])
-def test_the_held_back_tail_selects_and_is_not_trained_on(kind, horizon, monkeypatch):
+def test_the_held_back_tail_selects_and_is_not_trained_on(kind, monkeypatch):
     """Half of the four training frames are held back. Where they show what the start does, the start wins."""
     monkeypatch.setattr(module, "TAIL_FRACTION", 0.5)
-    settings = field_fit(selection="tail", horizon=horizon)
+    monkeypatch.setattr(module, "CHECK_EVERY", 1)
+    settings = field_fit(selection="tail")
     start = small.fit_problem().twin
     problems = [small.fit_problem(seen, fit=settings, kind=kind) for seen in (small.observations(), observed_as(start, 3))]
     learned, stayed = (fit(problem) for problem in problems)
     for column in ("loss", "gradient_norm", "learning_rate"):
         assert learned.history[column].tolist() == stayed.history[column].tolist()
-    assert learned.history["tail_loss"].tolist() != stayed.history["tail_loss"].tolist()
+    assert learned.history["rollout_loss"].tolist() != stayed.history["rollout_loss"].tolist()
     assert learned.facts["best_epoch"] > 0
     assert stayed.facts["best_epoch"] == -1
     assert_same_twin(stayed.twin, start)
-    assert stayed.facts["best_loss"] == pytest.approx(0, abs=1e-12)
+    assert stayed.facts["rollout_loss"] == pytest.approx(0, abs=1e-12)
     # What selected is the loss of the twin that comes out, over the frames held back.
-    assert learned.facts["best_loss"] == pytest.approx(loss_of(learned.twin, small.observations(), range(3, 5)), rel=MEAN)
-    assert learned.facts["best_loss"] == learned.history["tail_loss"].min()
+    assert learned.facts["rollout_loss"] == pytest.approx(loss_of(learned.twin, small.observations(), range(3, 5)), rel=MEAN)
+    assert learned.facts["rollout_loss"] == learned.history["rollout_loss"].min()
 
 
-def test_the_loss_of_a_one_step_epoch_belongs_to_the_values_before_the_step():
-    settings = {"horizon": 0, "learning_rate": 5e-2}
-    start = small.fit_problem().twin
-    once = fit(small.fit_problem(fit=config.Fit(epochs=1, **settings)))
-    assert once.facts["best_epoch"] == -1
-    assert_same_twin(once.twin, start)
-    assert once.facts["best_loss"] == pytest.approx(loss_of(start, small.observations(), range(1, 5)), rel=MEAN)
-    thrice = fit(small.fit_problem(fit=config.Fit(epochs=3, **settings)))
-    assert thrice.facts["best_epoch"] == 1  # the loss seen in epoch 2 is that of the values at the end of epoch 1
-    assert thrice.facts["best_loss"] == thrice.history["loss"].iloc[2] == thrice.history["loss"].min()
-    assert thrice.facts["best_loss"] == pytest.approx(loss_of(thrice.twin, small.observations(), range(1, 5)), rel=MEAN)
+@pytest.mark.parametrize("kind", ["springs", "field"])
+@pytest.mark.parametrize(("horizon", "rate", "better"), [(1, 1e-2, True), (0, 1e-2, True), (1, 3.0, False)])
+def test_no_fit_ends_behind_its_search_and_its_loss_is_that_of_its_rollout(kind, horizon, rate, better):
+    problem = small.fit_problem(fit=field_fit(epochs=6, learning_rate=rate, horizon=horizon), kind=kind)
+    result = fit(problem)
+    facts, seen = result.facts, small.observations()
+    assert (facts["best_epoch"] >= 0) == (facts["rollout_loss"] < facts["search_loss"]) == better
+    for twin, loss in ((problem.twin, facts["search_loss"]), (result.twin, facts["rollout_loss"])):
+        assert loss == pytest.approx(loss_of(twin, seen, range(1, 5)), rel=1e-5)
+    assert result.history["rollout_loss"].notna().tolist() == [False] * 4 + [True] * 2
+    released = fit(replace(problem, fit=replace(problem.fit, selection="training_loss")))
+    assert released.facts["best_epoch"] == released.history["loss"].argmin()
+
+
+def test_a_fit_ends_when_rollouts_have_stopped_falling(monkeypatch):
+    monkeypatch.setattr(module, "CHECK_EVERY", 2)
+    monkeypatch.setattr(module, "PLATEAU_EPOCHS", 4)
+    idle, learning, all_epochs = (
+        fit(small.fit_problem(fit=config.Fit(epochs=7, learning_rate=rate, plateau=plateau)))
+        for rate, plateau in ((1e-7, 0.01), (3e-2, 0.01), (1e-7, 0.0))
+    )
+    assert [(one.facts["epochs"], one.facts["converged"]) for one in (idle, learning, all_epochs)] == [
+        (4, True),
+        (7, False),
+        (7, False),
+    ]
 
 
 # Learning rates -------------------------------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ def test_search_and_fit_start_with_the_observed_velocity(kind):
     (truth,) = small.judge(replace(problem, losses=config.Losses(acceleration=0.0)), [twin], loss)
     fitted = fit(small.fit_problem(seen, twin=twin, simulation=simulation, fit=config.Fit(epochs=1)))
     # Millimeters squared: dashpots of controllers, which the released simulator holds at rest, leave a little.
-    assert (truth.cost < 1e-6) == (fitted.facts["best_loss"] < 1e-6) == (kind == "observed"), (
+    assert (truth.cost < 1e-6) == (fitted.facts["rollout_loss"] < 1e-6) == (kind == "observed"), (
         truth.cost,
-        fitted.facts["best_loss"],
+        fitted.facts["rollout_loss"],
     )

@@ -1,7 +1,7 @@
 """One trial of a sweep: search and fit with its settings, judged by a tail of the training frames, which neither has seen.
 
-Search and fit see the frames before the tail. The value of a trial is the loss over the tail of the twin that the method's own rule
-(`fit.selection`) selects, averaged over scenarios. Frames after the training frames are removed before anything is computed.
+Search and fit see the frames before the tail. The value of a trial is the loss over the tail of the twin that it selects
+(`fit.selection: tail`), averaged over scenarios. Frames after the training frames are removed before anything is computed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neuspring.core.provenance import code_digest
 from neuspring.core.records import StageRecord, canonical, digest_file
 from neuspring.extensions.tuning.space import SWEEP_SEED, Plan
 from neuspring.stages.search import search as search_stage
-from neuspring.twin.fit import FitProblem, NonFinite, eligible, fit, start_tail_loss, tail_start
+from neuspring.twin.fit import FitProblem, NonFinite, fit, start_loss, tail_start
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,6 @@ def value_of(trial: optuna.Trial, plan: Plan, scenes: Sequence[TrainingScene], f
         problem = FitProblem(
             observations=scene.training,
             twin=Twin.load(record.file("twin", path)),
-            # The loss over the tail is needed after every epoch, whichever rule selects one.
             fit=replace(settings.fit, selection="tail"),
             simulation=settings.simulation,
             losses=settings.losses,
@@ -97,11 +96,11 @@ def value_of(trial: optuna.Trial, plan: Plan, scenes: Sequence[TrainingScene], f
         )
 
         def report_epoch(history: Sequence[Mapping[str, Any]]) -> None:
-            if len(scenes) == 1 and (loss := history[-1]["tail_loss"]) is not None:
+            if len(scenes) == 1 and (loss := history[-1]["rollout_loss"]) is not None:
                 report(history[-1]["epoch"], loss)
 
         try:
-            losses.append(_fitted(problem, settings, report_epoch) if plan.method.fit else start_tail_loss(problem))
+            losses.append(fit(problem, on_epoch=report_epoch).rollout_loss if plan.method.fit else start_loss(problem))
         except (NonFinite, NumericalFailure) as failure:
             raise NumericalFailure(f"{scene.name}, fit: {failure}") from failure
         if len(scenes) > 1:
@@ -132,15 +131,3 @@ def searched(scene: TrainingScene, settings: Config, clusters: int, device: str,
                 observations=scene.head, settings=settings, clusters=clusters, seed=SWEEP_SEED, device=device, output=record
             )
     return record
-
-
-def _fitted(problem: FitProblem, settings: Config, report: Any) -> float:
-    """The loss over the tail of the twin that `settings.fit.selection` selects."""
-    result = fit(problem, on_epoch=report)
-    if settings.fit.selection == "tail":
-        return result.best_loss  # the start may be best
-    rows = result.history.to_dict("records")  # type: ignore[assignment]
-    kept = [row for row in rows if not row["rolled_back"] and eligible(row["epoch"], problem)]
-    if not kept:
-        raise NumericalFailure(f"no epoch with a finite loss over the tail; rolled back: {'; '.join(result.facts['rollbacks'])}")
-    return float(min(kept, key=lambda row: row["loss"])["tail_loss"])
