@@ -69,6 +69,7 @@ def transfer(
                 twin,
                 observations,
                 safety=settings.simulation.safety,
+                rest_lengths=settings.simulation.rest_lengths,
                 keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
             )
             moved = body_of(moved).for_prediction(moved)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neuspring.config import Config
+from neuspring.config.simulation import RestLengths
 from neuspring.config.twin import TERMS
 from neuspring.core.artifacts import Artifact, Observations, Twin
 from neuspring.registry import Registry, modules
@@ -166,8 +167,8 @@ class Body(ABC):
         """Raise InputError unless one twin can be judged on all recordings."""
 
     @abstractmethod
-    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
-        """The twin in frame 0 of another recording of its object.
+    def on_recording(self, twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
+        """The twin in frame 0 of another recording of its object (`simulation.rest_lengths`).
 
         Its simulation is still the twin's. Raises InputError if the recording is of another body.
         """

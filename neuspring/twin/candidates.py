@@ -236,7 +236,7 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
     try:
         twin = candidate(problem, values, push)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
-        moved = (move(twin, seen, keep_frame_time=released) for seen in problem.pool)
+        moved = (move(twin, seen, keep_frame_time=released, rest_lengths=settings.rest_lengths) for seen in problem.pool)
         family = (twin, *(with_substeps(each, settings, released) for each in moved))
     except NumericalFailure as failure:
         row["reason"] = str(failure)

@@ -287,8 +287,8 @@ class TwinFit:
     def __init__(self, problem: FitProblem) -> None:
         self.problem, settings = problem, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
-        released = problem.quirks.frame_time_667
-        others = [(seen, move(problem.twin, seen, keep_frame_time=released)) for seen in problem.pool]
+        released, lengths = problem.quirks.frame_time_667, problem.simulation.rest_lengths
+        others = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
         self.recordings = [FitRecording(problem, *one) for one in [(problem.observations, problem.twin), *others]]
         self.trained = list(self.parameters.parameters())
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)

@@ -92,7 +92,7 @@ def nearest(points: torch.Tensor, nodes: torch.Tensor) -> torch.Tensor:
 def chamfer(loss: FrameLoss, state: FrameState) -> torch.Tensor:
     """From visible points to nearest surface nodes, over the points that are visible."""
     points = loss.points[state.frame][loss.visible[state.frame]]
-    e = state.x[nearest(points, state.x.detach()[: loss.surface])] - points
+    e = state.x.index_select(0, nearest(points, state.x.detach()[: loss.surface])) - points
     return e.square().sum() / max(loss.counts[state.frame][0], 1)
 
 
@@ -126,7 +126,7 @@ def silhouette(loss: FrameLoss, state: FrameState) -> torch.Tensor | None:
     inside = ~torch.isnan(image.inside[state.frame, :, 0])
     points = torch.nan_to_num(image.inside[state.frame])
     near = torch.cdist(points, image.project(state.x.detach()[: loss.surface])).argmin(dim=1)
-    away = image.size * (u[near] - points) * inside[:, None]
+    away = image.size * (u.index_select(0, near) - points) * inside[:, None]
     left = image.size * image.distance(state.frame, u)[:, None]
     return _mean_square(away, inside.sum()) + _mean_square(left, len(u))
 

@@ -1,16 +1,18 @@
 """A twin on another recording of the same object, where both have the same nodes in the same order.
 
-Springs keep their ends, stiffness and dashpots; rest lengths follow the recording's shape at rest. Up, ground and frame time are
-the recording's.
+Springs keep their ends, stiffness and dashpots. Frame 0 is a pose under load, so springs of the object keep their rest lengths too;
+with `rest_lengths: recording` they follow the recording's frame 0. Up, ground and frame time are the recording's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from neuspring.config.simulation import RestLengths
 from neuspring.core.artifacts import Observations, Topology, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.text import listed
@@ -23,7 +25,14 @@ LEAST_LENGTH = 1e-9
 """Shorter springs count as this long, m."""
 
 
-def move(twin: Twin, observations: Observations, *, keep_frame_time: bool = False, safety: float = 0.8) -> Twin:
+def move(
+    twin: Twin,
+    observations: Observations,
+    *,
+    keep_frame_time: bool = False,
+    safety: float = 0.8,
+    rest_lengths: RestLengths = "object",
+) -> Twin:
     """The twin in frame 0 of another recording of its object.
 
     Its body decides what stays (`Body.on_recording`). Up, ground and, unless `keep_frame_time`, the frame time are the recording's.
@@ -37,18 +46,19 @@ def move(twin: Twin, observations: Observations, *, keep_frame_time: bool = Fals
         ground=scenario.ground,
         self_collision=scenario.self_collision,
     )
-    return body.stable(replace(body.on_recording(twin, observations), simulation=simulation), safety)
+    return body.stable(replace(body.on_recording(twin, observations, rest_lengths), simulation=simulation), safety)
 
 
-def on_nodes(twin: Twin, observations: Observations) -> Twin:
+def on_nodes(twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
     """A lattice on the nodes and hands of another recording, node i on node i.
 
-    The rest shape is frame 0 unless recorded. A spring keeps its ends, stiffness, dashpot, and the ratio of its rest length to the
-    distance of its ends where it has no force: in the rest shape, or in frame 0 where the twin's controllers rest there. Nodes keep
-    their masses. Raises InputError if the nodes do not correspond (`corresponds`), or a spring has no length.
+    A spring keeps its ends, stiffness and dashpot, a node its mass. With `rest_lengths: object` springs of the object keep their
+    rest lengths, with `recording` their ratio to the distance of their ends in frame 0. Springs of controllers always keep the
+    ratio, and all do where the recording has a rest shape. Raises InputError if the nodes do not correspond, or a spring has no
+    length.
     """
     if corresponds(twin.topology, observations):
-        return replace(twin, topology=_same_nodes(twin.topology, observations))
+        return replace(twin, topology=_same_nodes(twin.topology, observations, rest_lengths))
     there = f"{len(observations.nodes)} nodes and {observations.controller_points.shape[1]} controllers"
     own = f"{len(twin.topology.nodes)} nodes and {len(twin.topology.controllers)} controllers"
     rule = f"the recording must have the twin's {own} in the same order"
@@ -71,7 +81,7 @@ def corresponds(topology: Topology, observations: Observations) -> bool:
     return bool(np.median(np.abs(ratio - np.median(ratio))) < LENGTH_SPREAD)
 
 
-def _same_nodes(topology: Topology, observations: Observations) -> Topology:
+def _same_nodes(topology: Topology, observations: Observations, rest_lengths: RestLengths) -> Topology:
     """The topology with the nodes of a recording, node i on node i."""
     nodes, hands = observations.nodes, observations.controller_points[0]
     rest, springs = topology.controller_rest, topology.springs
@@ -85,7 +95,12 @@ def _same_nodes(topology: Topology, observations: Observations) -> Topology:
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         rule = "the ends of a spring may not coincide in the rest shape"
         raise InputError(f"transfer to {observations.scenario.name}", rule, f"spring {pair}")
-    return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)
+    changed: dict[str, Any] = {"rest_shape": observations.rest_shape}
+    if rest_lengths == "object" and not len(observations.rest_shape):
+        own = topology.object_spring_count
+        lengths[:own] = topology.rest_lengths[:own]
+        changed = {"rest_shape": topology.canonical, "controller_rest": "first_frame"}
+    return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, **changed)
 
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:

@@ -18,7 +18,7 @@ def require_answers(name, twin, seen):
     assert body.node_stiffness(twin).shape == (len(nodes),)
     assert lines.masses.sum() > 0 and body.mass_at(twin, 0) > 0
     body.check(body.stable(twin, 0.8))
-    np.testing.assert_array_equal(body.on_recording(twin, seen).topology.nodes, nodes)
+    np.testing.assert_array_equal(body.on_recording(twin, seen, "recording").topology.nodes, nodes)
 
 
 def differing(before, after, prefix=""):

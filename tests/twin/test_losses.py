@@ -50,6 +50,19 @@ def assert_close(got: torch.Tensor, wanted: np.ndarray, relative: float) -> None
     np.testing.assert_allclose(got.detach().double().numpy() / scale, wanted / scale, atol=relative, rtol=0)
 
 
+def test_gradients_of_many_points_are_equal_in_every_call_with_two_threads() -> None:
+    points = torch.rand(1, 40_000, 3, generator=torch.Generator().manual_seed(0)).expand(2, -1, -1)
+    all_seen = torch.ones(points.shape[:2], dtype=torch.bool)
+    loss, nodes = FrameLoss(points, all_seen, all_seen, 100, Losses(track=0.0)), points[0, :100].clone().requires_grad_()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, *others = (torch.autograd.grad(loss(1, nodes), nodes)[0] for _ in range(8))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(first, other) for other in others)
+
+
 @pytest.mark.parametrize("k", CASES)
 def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
     """Small errors, errors beyond 1 m, nothing visible: values and gradients of each term, and their sum."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neuspring.config import Config
+from neuspring.config.simulation import RestLengths
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.extensions.rods.rod import Rod, rod_of
 from neuspring.extensions.rods.settings import RodFit
@@ -91,7 +92,7 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
 
         require_pool(here, pool)
 
-    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
+    def on_recording(self, twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
         """The rod on the line of frame 0; see `made.on_recording`."""
         from neuspring.extensions.rods.made import on_recording
 

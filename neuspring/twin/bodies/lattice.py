@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neuspring.config import Config
+from neuspring.config.simulation import RestLengths
 from neuspring.core.artifacts import Observations, Twin
 from neuspring.physics import stability
 from neuspring.twin.body import Body, FitTask, Learned, Lines, SearchOptions, SearchTask
@@ -90,11 +91,11 @@ and it goes on for the rest of dt.
 
         require_pool(here, pool)
 
-    def on_recording(self, twin: Twin, observations: Observations) -> Twin:
+    def on_recording(self, twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
         """Springs with their ends on the same nodes; see `transfer.on_nodes`."""
         from neuspring.twin.transfer import on_nodes
 
-        return on_nodes(twin, observations)
+        return on_nodes(twin, observations, rest_lengths)
 
     def solver(self, twin: Twin, device: str = "cpu") -> FrameSolver:
         from neuspring.physics.solver import solver_for
