@@ -134,5 +134,7 @@ def without_pictures(method: Method | None, config: Config) -> tuple[str, ...]:
 REFERENCES = ("static", "controller_lbs")
 """Methods that learn nothing: what others must be better than."""
 BASELINES = Registry(
-    "baselines", {name: Baseline(prediction=f"neuspring.baselines.references:{name}") for name in REFERENCES}, Baseline
+    "baselines",
+    {name: Baseline(prediction=f"neuspring.baselines.references:{name}", transfers=True) for name in REFERENCES},
+    Baseline,
 )

@@ -31,23 +31,23 @@ def _moves(rows: Rows) -> bool:
 )
 def transfer(
     targets: Sequence[Observations],
-    learned: MayFail,
     method: str,
     settings: Config,
     run: Recorder,
+    learned: MayFail | None = None,
     model: Annotated[str | None, "of a baseline, whose code then counts; none for twins"] = None,
     seed: int = 0,
     device: str = "auto",
 ) -> Written:
     """Learned model -> scores on other recordings of the object: transfer.parquet (task `transfer`), transfer_frames.parquet.
 
-    The latter has every distance in every frame (`scenario` is the target). Of targets with a center line, transfer_lines.npz has
-    the predicted line by target [F, V, 3], float32, m; vertices that a controller holds are where it is.
+    The latter has every distance in every frame (`scenario` is the target). transfer_positions.npz has the predicted nodes
+    [F, N, 3], float32, m, by target.
 
-    `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json). All frames after the
-    first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2 also set the initial velocity. A twin's
-    rest lengths are re-based on the target's rest shape, unless they were trained. A target must have the
-    same nodes in the same order. A rollout that diverges leaves out its target.
+    `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json); a model that learns
+    nothing goes without. All frames after the first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2
+    also set the initial velocity. A target must have the same nodes in the same order. A rollout that diverges leaves out its
+    target.
     """
     import numpy as np
     import pandas as pd
@@ -58,19 +58,20 @@ def transfer(
     from neuspring.twin.transfer import move
 
     tables, diverged = [pd.DataFrame(columns=list(metrics.SCORE_COLUMNS))], []
-    courses, lines = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
-    updates, record = 0, learned.record
-    twin = Twin.load(learned.file("twin")) if learned.has("twin") else None
-    for observations in targets if record.status == "ok" else ():
-        if twin is None:
-            trajectory = BASELINES[record.settings["model"]].predict(observations, learned.file("model"), None, device).trajectory
-        else:
+    courses, positions = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
+    updates, failure = 0, learned.record.reason if learned else ""
+    twin = Twin.load(learned.file("twin")) if learned and learned.has("twin") else None
+    for observations in () if failure else targets:
+        if model is not None:
+            file = learned.file("model") if learned else None
+            trajectory = BASELINES[model].predict(observations, file, None, device).trajectory
+        elif twin is not None and learned is not None:
             moved = move(
                 twin,
                 observations,
                 safety=settings.simulation.safety,
                 rest_lengths=settings.simulation.rest_lengths,
-                keep_frame_time=record.settings["released_quirks"]["frame_time_667"],
+                keep_frame_time=learned.record.settings["released_quirks"]["frame_time_667"],
             )
             moved = body_of(moved).for_prediction(moved)
             velocity = initial_velocity(observations, moved.simulation.initial_velocity)
@@ -86,13 +87,10 @@ def transfer(
         course = course.assign(scenario=observations.scenario.name, seconds=course["frame"] / observations.scenario.frame_rate)
         if trajectory.diverged_frame is None:
             courses.append(course[list(courses[0])])
-        if observations.line.size:
-            lines[observations.scenario.name] = observations.on_line(trajectory.positions).astype(np.float32)
-    files = run.beside(scores="transfer.parquet", frames="transfer_frames.parquet")
+        positions[observations.scenario.name] = trajectory.positions.astype(np.float32)
+    files = run.beside(scores="transfer.parquet", frames="transfer_frames.parquet", positions="transfer_positions.npz")
     for role, parts in (("scores", tables), ("frames", courses)):
         write_table(pd.concat([part for part in parts if len(part)] or parts), files[role])
-    if lines:
-        files |= run.beside(lines="transfer_lines.npz")
-        write_npz(files["lines"], lines, "{}", compress=True)
+    write_npz(files["positions"], positions, "{}", compress=True)
     facts: dict[str, Any] = {"diverged": diverged, "targets": len(targets)} | ({"spring_updates": updates} if updates else {})
-    return Written(files=files, facts=facts, failure=record.reason)
+    return Written(files=files, facts=facts, failure=failure)

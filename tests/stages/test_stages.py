@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from neuspring import config
+from neuspring.baselines import REFERENCES
 from neuspring.core.artifacts import Observations, Trajectory, Twin
 from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
@@ -112,11 +113,10 @@ def test_stages_that_simulate_count_their_spring_updates(finished):
     assert StageRecord.load(run.with_name("rollout.json")).facts["spring_updates"] == frames * per_frame
 
 
-def test_a_transfer_keeps_the_course_of_errors_and_the_line(finished, tmp_path):
+def test_a_transfer_keeps_positions_and_the_course_of_errors(finished, tmp_path):
     folder, run, _ = finished
     seen = Observations.load(folder / "small" / "observations.npz")
-    line = [len(seen.nodes), 3, 1]
-    replace(seen, line=np.array(line), scenario=replace(seen.scenario, name="other")).save(tmp_path / "other.npz")
+    replace(seen, scenario=replace(seen.scenario, name="other")).save(tmp_path / "other.npz")
     found = {"learned": run.with_name("fit.json"), "method": "phystwin", "settings": SETTINGS, "device": "cpu"}
     transfer(targets=[tmp_path / "other.npz", folder / "small/observations.npz"], **found, output=tmp_path / "transfer.json")
     record = StageRecord.load(tmp_path / "transfer.json")
@@ -125,12 +125,20 @@ def test_a_transfer_keeps_the_course_of_errors_and_the_line(finished, tmp_path):
     assert course.groupby(["scenario", "metric"])["frame"].apply(list).map(lambda each: each == list(range(frames))).all()
     means = course[course["frame"] > 0].groupby(["scenario", "metric"])["value"].mean()
     pd.testing.assert_series_equal(means, scores.set_index(["scenario", "metric"])["value"], check_like=True)
-    lines, _ = read_npz(record.file("lines", tmp_path / "transfer.json"))
+    positions, _ = read_npz(record.file("positions", tmp_path / "transfer.json"))
     trajectory = Trajectory.load(run.with_name("trajectory.npz"))
-    assert list(lines) == ["other"] and lines["other"].dtype == np.float32, "the other target has no line"
-    np.testing.assert_array_equal(lines["other"][:, 0], seen.controller_points[:, 0])
-    np.testing.assert_allclose(lines["other"][:, 1:], trajectory.positions[:, line[1:]], atol=1e-5)
+    assert list(positions) == ["other", seen.scenario.name]
+    for moved in positions.values():
+        np.testing.assert_allclose(moved, trajectory.positions, atol=1e-5)
     assert course["seconds"].max() == (frames - 1) / seen.scenario.frame_rate
+
+
+@pytest.mark.parametrize("model", REFERENCES)
+def test_what_learns_nothing_is_the_floor_of_transfers(finished, tmp_path, model):
+    seen = finished[0] / "small/observations.npz"
+    transfer(targets=[seen], method=model, model=model, settings=SETTINGS, device="cpu", output=tmp_path / "transfer.json")
+    scores = pd.read_parquet(tmp_path / "transfer.parquet")
+    assert set(scores["task"]) == {"transfer"} and (scores["value"] > 0).any()
 
 
 def test_a_method_without_second_stage_shares_the_search(finished):
@@ -157,7 +165,7 @@ def test_regions_and_a_field_pass_through_every_stage(tmp_path):
     assert np.unique(fitted.topology.labels).tolist() == [0, 1, 2]
     np.testing.assert_array_equal(fitted.topology.springs, coarse.topology.springs)
     counts = pd.read_parquet(run.with_name("history.parquet"))["metric"].value_counts().to_dict()
-    assert counts == {"loss": 2, "rollout_loss": 2, "gradient_norm": 2, "learning_rate": 2}
+    assert counts == {"loss": 2, "rollout_loss": 1, "gradient_norm": 2, "learning_rate": 2}
 
 
 def test_a_fit_that_its_settings_held_says_so_in_the_notes():

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from neuspring.core.artifacts import Observations
-from neuspring.core.files import write_npz, write_table
+from neuspring.core.files import write_table
 from neuspring.core.records import StageRecord, digest_file
 from neuspring.scores.metrics import SCORE_COLUMNS
 from tests.support import scenarios
@@ -32,10 +32,10 @@ def swinging(name: str, cable: str) -> Observations:
 
 
 def write_transfer(
-    results: Path, cable: str, method: str, seed: int, l1: Mapping[str, float], *, diverged: tuple[str, ...] = (), line: bool = True
+    results: Path, cable: str, method: str, seed: int, l1: Mapping[str, float], *, diverged: tuple[str, ...] = ()
 ) -> Path:
     """A transfer from `<cable>_train` with the error l1, m, on each clip, three times that of free markers; returns its record."""
-    source, courses, lines = f"{cable}_train", [], {}
+    source, courses = f"{cable}_train", []
     record = results / source / method / str(seed) / "transfer.json"
     record.parent.mkdir(parents=True, exist_ok=True)
     identity = {"category": cable, "method": method, "seed": seed, "task": "transfer", "unit": "m", "frames": FRAMES - 1}
@@ -48,15 +48,10 @@ def write_transfer(
         frames = np.arange(FRAMES)
         course = {"scenario": clip, "frame": frames, "seconds": frames / RATE}
         courses += [pd.DataFrame(course | {"metric": name, "value": error * (frames > 0)}) for name, error in errors.items()]
-        nodes = np.concatenate([seen.object_points, np.repeat(seen.nodes[None, 3:], FRAMES, axis=0)], axis=1)
-        lines[clip] = seen.on_line(nodes + np.array([0.0, 0.0, 3 * value])).astype(np.float32)
     endings = {"scores": ".parquet", "frames": "_frames.parquet"}
     paths = {role: record.with_name(f"transfer{suffix}") for role, suffix in endings.items()}
     write_table(pd.DataFrame(rows, columns=list(SCORE_COLUMNS)), paths["scores"])
     write_table(pd.concat(courses), paths["frames"])
-    if line:
-        paths["lines"] = record.with_name("transfer_lines.npz")
-        write_npz(paths["lines"], lines, "{}", compress=True)
     files = {role: [path.name, digest_file(path)] for role, path in paths.items()}
     facts = {"diverged": list(diverged), "targets": len(l1) + len(diverged)}
     StageRecord(stage="transfer", status="ok", files=files, facts=facts).save(record)

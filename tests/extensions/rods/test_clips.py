@@ -86,7 +86,7 @@ def test_a_mean_of_fewer_clips_is_marked_and_never_the_best(tmp_path):
 def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatch):
     results, output = tmp_path / "results", tmp_path / "tables"
     write_transfer(results, "DLO3", "rod", 0, CLIPS)
-    write_transfer(results, "DLO3", "model_b_pooled", 0, {clip: 2 * value for clip, value in CLIPS.items()}, line=False)
+    write_transfer(results, "DLO3", "model_b_pooled", 0, {clip: 2 * value for clip, value in CLIPS.items()})
     output.mkdir()
     runs = ["--scenarios", "DLO3_train", "--methods", "rod", "model_b_pooled", "--seeds", "0"]
     command, known = (
