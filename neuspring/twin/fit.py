@@ -508,7 +508,7 @@ def converged(history: Sequence[Mapping[str, Any]], start: float, plateau: float
     """
 
     def lowest(rows: Sequence[Mapping[str, Any]]) -> float:
-        return min([start, *(row["rollout_loss"] for row in rows if row["rollout_loss"] is not None)])
+        return min([start, *(float(row["rollout_loss"]) for row in rows if row["rollout_loss"] is not None)])
 
     before = history[:-PLATEAU_EPOCHS]
     due = len(history) >= PLATEAU_EPOCHS and len(history) % CHECK_EVERY == 0
