@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Observations", "Topology", "Trajectory", "Twin",
-    "fit", "load_run", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
+    "fit", "load_run", "move", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
 ]  # fmt: skip
 Settings = Config | Mapping[str, Any] | Path | str | None
 """An object, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files (with commas between them), or none: the defaults."""
@@ -157,6 +157,17 @@ def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto")
     if paths.ndim != 3 or paths.shape[1:] != (controllers, 3) or not len(paths):
         raise InputError("hands", f"must be observations, or positions [T, {controllers}, 3] in meters", paths.shape)
     return rollout.roll_out(twin, paths, device)
+
+
+def move(twin: Twin, observations: Observations, settings: Settings = None) -> Twin:
+    """A twin in frame 0 of another recording of its object, whose node i is the twin's node i; `roll_out` predicts that recording.
+
+    Raises InputError for a recording of another object.
+    """
+    from neuspring.twin.transfer import move as moved
+
+    simulation = read_settings(settings).simulation
+    return moved(twin, observations, safety=simulation.safety, rest_lengths=simulation.rest_lengths)
 
 
 def score(trajectory: Trajectory, observations: Observations) -> pd.DataFrame:

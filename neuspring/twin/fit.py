@@ -57,6 +57,8 @@ CHECK_EVERY = 5
 """Epochs between two rollouts. All fits that share launches make theirs together."""
 PLATEAU_EPOCHS = 20
 """Epochs in which the lowest loss of rollouts must fall by `fit.plateau`, else the fit has converged."""
+MOST_GROWTH = 4
+"""Substeps at most, as a multiple of the search's: a few springs that stiffen without end would set the cost of all."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -191,7 +193,8 @@ class FitRecording:
         velocity = initial_velocity(observations, twin.simulation.initial_velocity)
         self.rest: _Motion = (torch.tensor(graph.nodes, device=device), _tensor(velocity, device), None)
         self.safety = problem.simulation.safety
-        self.may_grow = problem.simulation.substeps == "auto" and not problem.quirks.frame_time_667
+        may_grow = problem.simulation.substeps == "auto" and not problem.quirks.frame_time_667
+        self.most_substeps = min(MOST_GROWTH * twin.simulation.substeps, stability.MAX_SUBSTEPS) if may_grow else 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
 
@@ -214,7 +217,7 @@ class FitRecording:
         """The present parameters, packed, after checking that they can be integrated.
 
         Takes more substeps where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
-        `MAX_SUBSTEPS`) and the bound is passed.
+        MOST_GROWTH, `MAX_SUBSTEPS`) and the bound is passed.
         """
         packed = parameters.pack(self.twin.simulation.substep, self.start)
         springs = packed["springs"].detach().double().cpu().numpy()
@@ -244,7 +247,7 @@ class FitRecording:
         if spectrum.load(simulation.substep) < enough:
             return simulation.substeps
         count = stability.smallest_safe_substeps(spectrum, simulation.frame_time, self.safety)
-        if self.may_grow and count <= stability.MAX_SUBSTEPS:
+        if count <= self.most_substeps:
             return count
         if spectrum.load(simulation.substep) >= stability.STABILITY_LIMIT:
             raise NonFinite(f"stiffness grew beyond what {simulation.substeps} substeps per frame can integrate")
