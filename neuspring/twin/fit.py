@@ -2,7 +2,7 @@
 
 An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the whole
 training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the
-state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every CHECK_EVERY epochs a
+state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every ROLLOUT_EVERY epochs a
 rollout of the parameters from rest gives the loss of a twin. The twin with the lowest is the result, the start among them: no fit
 ends behind its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends when
 they have stopped falling. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient
@@ -53,7 +53,7 @@ ADJOINT_LIMIT = 100.0
 ends (`solver.AdjointLimit`)."""
 TAIL_FRACTION = 0.2
 """Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
-CHECK_EVERY = 5
+ROLLOUT_EVERY = 5
 """Epochs between two rollouts. All fits that share launches make theirs together."""
 PLATEAU_EPOCHS = 20
 """Epochs in which the lowest loss of rollouts must fall by `fit.plateau`, else the fit has converged."""
@@ -514,7 +514,7 @@ def converged(history: Sequence[Mapping[str, Any]], start: float, plateau: float
         return min([start, *(float(row["rollout_loss"]) for row in rows if row["rollout_loss"] is not None)])
 
     before = history[:-PLATEAU_EPOCHS]
-    due = len(history) >= PLATEAU_EPOCHS and len(history) % CHECK_EVERY == 0
+    due = len(history) >= PLATEAU_EPOCHS and len(history) % ROLLOUT_EVERY == 0
     return plateau > 0 and due and lowest(history) > (1 - plateau) * lowest(before)
 
 
@@ -540,7 +540,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
         if run.gradients and (median := float(np.median(run.gradients))):
             state.gradient_over_epsilon = median / problem.fit.epsilon
         released = problem.fit.selection == "training_loss"
-        if not released and ((epoch + 1) % CHECK_EVERY == 0 or epoch == problem.fit.epochs - 1):
+        if not released and ((epoch + 1) % ROLLOUT_EVERY == 0 or epoch == problem.fit.epochs - 1):
             losses["rollout_loss"] = yield from run.rollout_loss()
         state.values, state.moments = run.parameters.copy(), adam_arrays(run.optimizer)
         state.substeps = run.twin.simulation.substeps

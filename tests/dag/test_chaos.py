@@ -37,15 +37,10 @@ def at_work(process):
         time.sleep(0.05)
 
 
-def quietly(project):
-    return subprocess.Popen(
-        arguments(project, CHANGES),
-        cwd=project,
-        env=environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+def begun(project, stdout=subprocess.DEVNULL):
+    """A run in a session of its own, which can be killed whole."""
+    ways = {"stdout": stdout, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+    return subprocess.Popen(arguments(project, CHANGES), cwd=project, env=environment(), **ways)
 
 
 def table(project):
@@ -62,20 +57,16 @@ def steps_made(project):
 
 def kill(project, draw, *, whole):
     """Run, and kill all processes, or the jobs alone, at a random moment."""
-    process = quietly(project)
+    process = begun(project)
     at_work(process)
     time.sleep(draw.uniform(0, 8))
-    if whole:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    else:
-        for _ in range(3):
-            for job in jobs_of(process):
-                with contextlib.suppress(psutil.Error):
-                    job.kill()
-            time.sleep(draw.uniform(0, 2))
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+    for _ in range(0 if whole else 3):
+        for job in jobs_of(process):
+            with contextlib.suppress(psutil.Error):
+                job.kill()
+        time.sleep(draw.uniform(0, 2))
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
@@ -93,20 +84,18 @@ def test_a_run_that_is_disturbed_in_every_way_ends_with_the_table_of_an_undistur
     for _ in range(7):
         kill(project, draw, whole=True)
 
-    process = quietly(project)
+    process = begun(project)
     at_work(process)
     assert f"process {process.pid} on " in run(project, CHANGES, fails=True)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
-    interrupted = subprocess.Popen(
-        arguments(project, CHANGES), cwd=project, env=environment(), stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+    interrupted = begun(project, subprocess.PIPE)
     at_work(interrupted)
-    begun = time.monotonic()
+    moment = time.monotonic()
     os.killpg(interrupted.pid, signal.SIGINT)
     output, _ = interrupted.communicate(timeout=PATIENCE)
-    assert time.monotonic() - begun < 20 and "Rerun the same command to resume." in output
+    assert time.monotonic() - moment < 20 and "Rerun the same command to resume." in output
 
     for _ in range(4):
         kill(project, draw, whole=False)

@@ -11,7 +11,7 @@ from neuspring.core.errors import InputError
 from neuspring.draw.video import Video
 
 
-def write_video(path: Path, frames, rate: float, quality: int = 20) -> None:
+def write_video(path: Path, frames, rate: float, quality: int = 20):
     with Video(path, rate, quality) as video:
         for frame in frames:
             video.add(frame)

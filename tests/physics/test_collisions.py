@@ -75,7 +75,7 @@ def listed(solver: FrameSolver, twin: int) -> list[list[int]]:
 
 @pytest.mark.parametrize(("device", "threads"), WAYS)
 @pytest.mark.parametrize("capacity", [1, 5, 500])
-def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str, threads: bool) -> None:
+def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str, threads: bool):
     """Every list holds those of the first `capacity` partners in node order who list the node as well."""
     x = clump(7, 4)
     partners, overflow = lists(x, capacity, frames=3, device=device, threads=threads)
@@ -85,7 +85,7 @@ def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str, t
     assert overflow == 3 * 7 * max(6 - capacity, 0)
 
 
-def test_candidates_come_from_the_frame_start() -> None:
+def test_candidates_come_from_the_frame_start():
     """Pairs that come near within a frame are found in the next one (as released)."""
     body = scene(2, self_collision=True, contact_distance=DISTANCE, substeps=10, frame_time=0.01)
     x, v = np.array([[0.0, 0, 0], [0.021, 0, 0]]), np.array([[0.5, 0, 0], [-0.5, 0, 0]])
@@ -140,7 +140,7 @@ CLOUDS = ("around the origin", "far away", "cell borders", "far cell borders", "
 
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
 @pytest.mark.parametrize("kind", CLOUDS)
-def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype) -> None:
+def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype):
     x = cloud(kind)
     wanted = expected(x, dtype, DISTANCE)
     assert sum(map(len, wanted)) > len(x)
@@ -162,7 +162,7 @@ def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("capacity", [1, 5, 50])
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int) -> None:
+def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int):
     """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
     clouds = crowds(17)
     clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
@@ -173,7 +173,7 @@ def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: 
     assert (overflow[2] > 100) == (capacity < 50)
 
 
-def test_contact_distances_are_those_of_each_twin() -> None:
+def test_contact_distances_are_those_of_each_twin():
     """The grid's cells are as wide as the largest; a twin with a smaller one lists no more than its own."""
     x = cloud("around the origin")
     distances = (0.005, 0.02, 0.011, 0.013, 0.017)
@@ -187,7 +187,7 @@ def test_contact_distances_are_those_of_each_twin() -> None:
 
 @pytest.mark.parametrize("apart", [0.0, 0.2, 0.49, 0.51, 3.0])
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-def test_twins_that_are_alike_share_a_search(dtype: torch.dtype, apart: float) -> None:
+def test_twins_that_are_alike_share_a_search(dtype: torch.dtype, apart: float):
     """Nodes up to `apart` contact distances from those of the first twin, and whole bodies anywhere: all pairs are found."""
     rng = np.random.default_rng(5)
     x = cloud("around the origin")
@@ -207,7 +207,7 @@ def crowded_twin(capacity: int) -> Twin:
     return twin_of(body, x, hands[0])
 
 
-def test_a_rollout_reports_overflow() -> None:
+def test_a_rollout_reports_overflow():
     hands = random_scene(41, nodes=12, self_collision=True)[3]
     roomy = rollout.roll_out(crowded_twin(500), hands)
     tight = rollout.roll_out(crowded_twin(1), hands)
@@ -226,7 +226,7 @@ def thrown(frames: int, when: int, speed: float) -> tuple[Twin, np.ndarray]:
     return twin_of(body, np.zeros((1, 3)), hands[0]), hands
 
 
-def test_a_diverged_rollout_is_a_named_result(tmp_path) -> None:
+def test_a_diverged_rollout_is_a_named_result(tmp_path):
     """It keeps the frames before, says when and why, and round-trips through its file."""
     twin, hands = thrown(8, 4, 1e7)
     result = rollout.roll_out(twin, hands)
@@ -239,12 +239,12 @@ def test_a_diverged_rollout_is_a_named_result(tmp_path) -> None:
     assert (again.diverged_frame, again.reason, len(again.positions)) == (4, result.reason, 4)
 
 
-def test_a_rollout_that_ends_in_nan_is_diverged_too() -> None:
+def test_a_rollout_that_ends_in_nan_is_diverged_too():
     """NaN compares false with everything; infinite forces make NaN within the frame."""
     assert rollout.roll_out(*thrown(5, 2, np.finfo(np.float32).max)).diverged_frame == 2
 
 
-def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
+def test_a_rollout_starts_at_rest_and_reports_progress():
     body, x, _, hands = random_scene(42)
     twin, seen = twin_of(body, x, hands[0]), []
     result = rollout.roll_out(twin, hands, progress=seen.append)
@@ -255,7 +255,7 @@ def test_a_rollout_starts_at_rest_and_reports_progress() -> None:
     np.testing.assert_allclose(result.positions, expected, atol=2e-5)
 
 
-def test_an_unstable_rollout_is_refused() -> None:
+def test_an_unstable_rollout_is_refused():
     body, x, _, hands = random_scene(42)
     twin = twin_of(replace(body, simulation=replace(body.simulation, frame_time=1.0, substeps=1)), x, hands[0])
     with pytest.raises(InputError, match="substep must stay below"):

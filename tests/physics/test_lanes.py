@@ -90,7 +90,7 @@ def member_alone(number: int, variant: str, dtype: torch.dtype) -> Results:
     return alone(member(number, variant), dtype)
 
 
-def assert_same(got: Results, wanted: Results, label: Any = "") -> None:
+def assert_same(got: Results, wanted: Results, label: Any = ""):
     assert got.keys() == wanted.keys()
     for name, values in wanted.items():
         np.testing.assert_array_equal(got[name], values, err_msg=f"{label} {name}")
@@ -105,14 +105,14 @@ def of(population: Results, number: int) -> Results:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(("dtype", "count"), SIZES)
-def test_a_twin_gets_what_it_gets_alone(dtype: torch.dtype, count: int, variant: str) -> None:
+def test_a_twin_gets_what_it_gets_alone(dtype: torch.dtype, count: int, variant: str):
     got = together([member(number, variant) for number in range(count)], dtype)
     for number in range(count):
         assert_same(of(got, number), member_alone(number, variant, dtype), number)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_twins_differ_and_are_lively(variant: str) -> None:
+def test_twins_differ_and_are_lively(variant: str):
     """Otherwise equality would say little: each reaches its contacts, and none is another's copy."""
     members = [member(number, variant) for number in range(17)]
     simulation = members[0].body.simulation
@@ -126,7 +126,7 @@ def test_twins_differ_and_are_lively(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_twins_have_graphs_of_their_own(variant: str) -> None:
+def test_twins_have_graphs_of_their_own(variant: str):
     """The solver holds the union of their springs; absent ones have neither stiffness nor dashpot, and change nothing."""
     members, rng = [member(number, variant) for number in range(6)], np.random.default_rng(1)
     present = rng.random((6, len(members[0].body.springs))) < 0.6
@@ -144,7 +144,7 @@ def test_twins_have_graphs_of_their_own(variant: str) -> None:
         assert_same(in_union, alone(one._replace(body=body), SINGLE), number)
 
 
-def assert_same_by_threads(got: Results, wanted: Results, variant: str) -> None:
+def assert_same_by_threads(got: Results, wanted: Results, variant: str):
     """Bit for bit; but adjoints of impulses add to both nodes of a pair in any order."""
     for name, values in wanted.items():
         if VARIANTS[variant].get("self_collision") and name.startswith("adjoint"):
@@ -155,7 +155,7 @@ def assert_same_by_threads(got: Results, wanted: Results, variant: str) -> None:
 
 @pytest.mark.parametrize(("device", "threads"), WAYS[1:])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(variant: str, device: str, threads: bool) -> None:
+def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(variant: str, device: str, threads: bool):
     members, options = [member(number, variant) for number in range(3)], {"device": device, "threads": threads}
     got = together(members, SINGLE, **options)
     for number, one in enumerate(members):
@@ -166,7 +166,7 @@ def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(v
 
 @pytest.mark.parametrize("broken", [0, 3])
 @pytest.mark.parametrize("how", ["nan", "infinite speed", "far away", "divergence"])
-def test_a_broken_twin_breaks_no_other(how: str, broken: int) -> None:
+def test_a_broken_twin_breaks_no_other(how: str, broken: int):
     members = [member(number, "all") for number in range(7)]
     one = members[broken]
     members[broken] = {
@@ -183,7 +183,7 @@ def test_a_broken_twin_breaks_no_other(how: str, broken: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("gravity", 1.6), ("self_collision", True), ("collision_capacity", 7)])
-def test_twins_share_their_physics(name: str, value: Any) -> None:
+def test_twins_share_their_physics(name: str, value: Any):
     """What the solver takes from the first would be wrong for the others."""
     body, *_ = member(0, "ground")
     with pytest.raises(InputError, match=rf"simulation\.{name}.*same for all twins"):
@@ -195,7 +195,7 @@ def test_twins_share_their_physics(name: str, value: Any) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.data())
-def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject) -> None:
+def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject):
     one = member(data.draw(st.integers(0, 5)), data.draw(st.sampled_from(sorted(VARIANTS))))
     count = len(one.body.springs)
     order = np.array(data.draw(st.permutations(range(count))))

@@ -41,7 +41,7 @@ def words(text: str) -> set[str]:
     return found
 
 
-def test_a_force_with_one_trained_parameter_has_few_places() -> None:
+def test_a_force_with_one_trained_parameter_has_few_places():
     found = set()
     for path in PACKAGE.rglob("*.py"):
         name, text = path.relative_to(PACKAGE).as_posix(), path.read_text(encoding="utf-8")

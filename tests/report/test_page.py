@@ -57,7 +57,7 @@ def small(tmp_path) -> Path:
 class Strict(HTMLParser):
     """Fails where tags do not close or a picture has no words."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.open: list[str] = []
         self.ids: Counter[str] = Counter()

@@ -171,7 +171,7 @@ def test_commands_make_tables_studies_and_explanations(tmp_path, capsys):
 
 
 def test_findings_of_runs_name_the_next_move():
-    params = {"search.result.at_ends": "drag", "fit.result.best_epoch": 0, "fit.result.springs": 9, "fit.result.object_springs": 9}
+    params = {"search.result.at_ends": "drag", "fit.result.best_epoch": -1, "fit.result.springs": 9, "fit.result.object_springs": 9}
     found = of_runs([run_record(scenario="b", method="ours", params=params), run_record(scenario="c", method="ours")])
     assert {one.name: one.remedy for _, one in found} == {
         "search at an end of its range": "Widen search.variables for drag.",

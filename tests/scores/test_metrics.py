@@ -38,7 +38,7 @@ def rollout(positions: np.ndarray, **fields: object) -> Trajectory:
 # Golden ---------------------------------------------------------------------------------------------------------------
 
 
-def test_golden_chamfer() -> None:
+def test_golden_chamfer():
     d = load("m04_chamfer_eval")
     surface, frames = int(d["num_surface_points"]), range(int(d["start"]), int(d["end"]))
     inputs = d["vertices"], d["object_points"], d["object_visibilities"]
@@ -50,7 +50,7 @@ def test_golden_chamfer() -> None:
         assert abs(got.mean() / d[trap] - 1) > TRAP
 
 
-def test_golden_track_error() -> None:
+def test_golden_track_error():
     d = load("m06_track_eval")
     end = int(d["train_frame"])
     got = metrics.track_errors(d["vertices"], d["gt_track_3d"])
@@ -64,7 +64,7 @@ def test_golden_track_error() -> None:
 # Rules ----------------------------------------------------------------------------------------------------------------
 
 
-def test_chamfer_is_the_l1_distance_of_visible_points_to_surface_nodes() -> None:
+def test_chamfer_is_the_l1_distance_of_visible_points_to_surface_nodes():
     seen = np.ones((5, 3), bool)
     seen[2] = [True, False, True]
     given = observations(object_visibility=seen)
@@ -76,7 +76,7 @@ def test_chamfer_is_the_l1_distance_of_visible_points_to_surface_nodes() -> None
     np.testing.assert_allclose(metrics.chamfer_per_frame(positions, given), [0.2, 0.2, 0.3, 0.2, 0.2], rtol=1e-6)
 
 
-def test_a_frame_in_which_nothing_is_visible_is_left_out() -> None:
+def test_a_frame_in_which_nothing_is_visible_is_left_out():
     """NaN per frame; the mean and its frame count are over the others; a task without any such frame gives no row."""
     seen = np.ones((5, 3), bool)
     seen[[1, 3, 4]] = False
@@ -90,7 +90,7 @@ def test_a_frame_in_which_nothing_is_visible_is_left_out() -> None:
     assert rows["value"].item() == pytest.approx(0.1, rel=1e-5)
 
 
-def test_tracks_are_matched_once_to_all_nodes() -> None:
+def test_tracks_are_matched_once_to_all_nodes():
     """The first track is nearest to the interior node at frame 0 and stays with it; the second appears late: never used."""
     tracks = np.full((5, 2, 3), np.nan)
     tracks[[0, 1, 3], 0] = [0.0, 0, 6.5]
@@ -107,7 +107,7 @@ def test_tracks_are_matched_once_to_all_nodes() -> None:
     assert rows["frames"].tolist() == [2, 2]
 
 
-def test_without_tracks_there_is_no_track_row() -> None:
+def test_without_tracks_there_is_no_track_row():
     late = np.full((5, 1, 3), np.nan)
     late[1:] = 0.0
     for own in ({}, {"tracks": late}):
@@ -117,7 +117,7 @@ def test_without_tracks_there_is_no_track_row() -> None:
         assert "chamfer" in set(rows["metric"]) and not {"track_error", "track_error_bound"} & set(rows["metric"])
 
 
-def test_a_row_says_what_it_is() -> None:
+def test_a_row_says_what_it_is():
     given = observations(tracks=np.zeros((5, 1, 3)))
     rows = metrics.score(rollout(np.tile(given.nodes, (5, 1, 1))), given, "ours", 7)
     assert tuple(rows.columns) == metrics.SCORE_COLUMNS
@@ -130,7 +130,7 @@ def test_a_row_says_what_it_is() -> None:
 
 
 @pytest.mark.parametrize(("end", "tasks"), [(1, []), (2, []), (3, ["reconstruction"]), (4, ["reconstruction"])])
-def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks: list[str]) -> None:
+def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks: list[str]):
     """Five frames, three of them training: diverging in frame `end` leaves only complete tasks, and never a NaN."""
     given = observations(tracks=np.zeros((5, 1, 3)))
     broken = rollout(np.tile(given.nodes, (end, 1, 1)), frame_count=5, diverged_frame=end, reason="node 0 left the scene")
@@ -149,7 +149,7 @@ def table(*rows: tuple[str, str, int, float, int]) -> pd.DataFrame:
     return found.assign(task="future", metric="chamfer", category="toy", unit="m")
 
 
-def test_both_averages() -> None:
+def test_both_averages():
     """Equal weights scenarios equally, frames weighs them by length; seeds are averaged within a scenario first."""
     long = ("ours", "long", 0, 1.0, 30), ("ours", "long", 1, 3.0, 30)
     row = metrics.averages(table(*long, ("ours", "short", 0, 5.0, 10), ("ours", "short", 1, 7.0, 10))).iloc[0]
@@ -160,7 +160,7 @@ def test_both_averages() -> None:
     assert row["seed_std"] == pytest.approx(np.std([3.0, 5.0], ddof=1))
 
 
-def test_scenarios_with_different_numbers_of_seeds() -> None:
+def test_scenarios_with_different_numbers_of_seeds():
     """Seeds are averaged first, so that a scenario with more of them weighs no more; no spread from scenarios that seeds lack."""
     scores = table(("ours", "a", 0, 9.0, 10), *(("ours", "b", seed, 1.0, 10) for seed in range(3)))
     row = metrics.averages(scores).iloc[0]
@@ -173,7 +173,7 @@ def test_scenarios_with_different_numbers_of_seeds() -> None:
 # Declarations -----
 
 
-def test_every_metric_of_the_papers_tables_is_declared_once() -> None:
+def test_every_metric_of_the_papers_tables_is_declared_once():
     assert {metric for name in paper.tables() for _, _, metric in paper.table(name)} == set(paper.metrics())
     assert list(paper.metrics()) == ["chamfer", "track_error", "iou", "psnr", "ssim", "lpips"]
     others = [name for name, metric in metrics.METRICS.items() if metric.in_studies and not metric.paper_name]
@@ -181,7 +181,7 @@ def test_every_metric_of_the_papers_tables_is_declared_once() -> None:
     assert len({metric.column for metric in metrics.METRICS.values()}) == len(metrics.METRICS)
 
 
-def test_values_are_printed_in_the_unit_of_the_table() -> None:
+def test_values_are_printed_in_the_unit_of_the_table():
     assert metrics.METRICS["chamfer"].text(0.00512) == "5.12"
     assert metrics.METRICS["psnr"].text(1.234, "+") == "+1.234"
     assert metrics.METRICS["iou"].shown(84.06) == metrics.METRICS["iou"].text(0.8406) == "84.1"
@@ -189,7 +189,7 @@ def test_values_are_printed_in_the_unit_of_the_table() -> None:
     assert metrics.METRICS["iou"].column == "IoU %"
 
 
-def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at(monkeypatch, tmp_path) -> None:
+def test_a_packages_metric_is_one_entry_that_is_scored_shown_and_may_be_aimed_at(monkeypatch, tmp_path):
     """As the registry gives it where an installed package names it in its entry points."""
     extent = metrics.Metric(
         name="extent", title="extent", heading="Extent", unit="m", shown_unit="cm", factor=100.0, digits=1, in_studies=True,

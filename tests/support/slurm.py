@@ -53,7 +53,7 @@ def submissions() -> list[dict[str, str]]:
     return sorted(jobs, key=lambda job: int(job["JobId"]))
 
 
-def _check() -> None:
+def _check():
     if os.geteuid() != 0:
         raise NoSlurmError("needs root, to start the daemons of Slurm")
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
@@ -85,7 +85,7 @@ def _own_settings() -> Iterator[None]:
                 path.unlink(missing_ok=True)
 
 
-def _write(folder: Path) -> None:
+def _write(folder: Path):
     key = folder / "munge.key"
     key.write_bytes(os.urandom(1024))
     key.chmod(0o600)
@@ -148,12 +148,12 @@ def _daemon(*command: str) -> Iterator[None]:
             process.wait()
 
 
-def _end_with_parent() -> None:
+def _end_with_parent():
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _wait(done, folder: Path, complaint: str) -> None:
+def _wait(done, folder: Path, complaint: str):
     deadline = time.monotonic() + PATIENCE
     while not done():
         if time.monotonic() > deadline:
@@ -166,7 +166,7 @@ def _output(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=30).stdout
 
 
-def _cancel_all() -> None:
+def _cancel_all():
     """What a failed test left running, so that no job outlives its node."""
     subprocess.run(["scancel", "--user=root"], check=False, timeout=30)
     deadline = time.monotonic() + PATIENCE

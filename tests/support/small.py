@@ -140,7 +140,7 @@ def fit_problem(seen: Observations | None = None, values: dict[str, float] | Non
     return FitProblem(**(settings | changes))  # type: ignore[arg-type]
 
 
-def assert_same_fit(got: FitResult | Exception, wanted: FitResult) -> None:
+def assert_same_fit(got: FitResult | Exception, wanted: FitResult):
     """Equal histories and twins, bit for bit."""
     assert isinstance(got, FitResult), got
     pd.testing.assert_frame_equal(got.history, wanted.history, check_exact=True)

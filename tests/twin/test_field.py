@@ -26,7 +26,7 @@ def field_of(at: np.ndarray | None = None, outputs: int = 2, seed: int = 0, **se
     return SpringField(points() if at is None else at, config.SpringFieldSettings(**settings), outputs, seed).double()
 
 
-def train(field: SpringField, target: torch.Tensor, steps: int = 5) -> None:
+def train(field: SpringField, target: torch.Tensor, steps: int = 5):
     """A few steps towards `target` [S, outputs]."""
     optimizer = torch.optim.Adam(field.parameters(), lr=1e-2)
     for _ in range(steps):

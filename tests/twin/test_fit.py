@@ -26,7 +26,7 @@ FIELD = config.SpringFieldSettings()
 
 
 @pytest.fixture(autouse=True)
-def small_field(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_field(monkeypatch: pytest.MonkeyPatch):
     """Fields small enough for tests."""
     for name, value in {"FIELD_CHANNELS": 4, "FIELD_HIDDEN": 16, "FIELD_BANDS": 2}.items():
         monkeypatch.setattr(f"neuspring.twin.field.{name}", value)
@@ -122,7 +122,7 @@ def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, kill
     assert continued.facts == whole.facts
 
 
-def assert_same_twin(twin: Twin, expected: Twin) -> None:
+def assert_same_twin(twin: Twin, expected: Twin):
     """Everything that a fit may change is equal, bit for bit."""
     assert twin.simulation == expected.simulation
     for name in ("stiffness", "dashpot"):
@@ -250,7 +250,7 @@ def loss_of(twin: Twin, seen: Observations, frames: range) -> float:
 def test_the_held_back_tail_selects_and_is_not_trained_on(kind, monkeypatch):
     """Half of the four training frames are held back. Where they show what the start does, the start wins."""
     monkeypatch.setattr(module, "TAIL_FRACTION", 0.5)
-    monkeypatch.setattr(module, "CHECK_EVERY", 1)
+    monkeypatch.setattr(module, "ROLLOUT_EVERY", 1)
     settings = field_fit(selection="tail")
     start = small.fit_problem().twin
     problems = [small.fit_problem(seen, fit=settings, kind=kind) for seen in (small.observations(), observed_as(start, 3))]
@@ -282,7 +282,7 @@ def test_no_fit_ends_behind_its_search_and_its_loss_is_that_of_its_rollout(kind,
 
 
 def test_a_fit_ends_when_rollouts_have_stopped_falling(monkeypatch):
-    monkeypatch.setattr(module, "CHECK_EVERY", 2)
+    monkeypatch.setattr(module, "ROLLOUT_EVERY", 2)
     monkeypatch.setattr(module, "PLATEAU_EPOCHS", 4)
     idle, learning, all_epochs = (
         fit(small.fit_problem(fit=config.Fit(epochs=7, learning_rate=rate, plateau=plateau)))

@@ -44,13 +44,13 @@ def case(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> dict[str,
     return {name: value.to(dtype) if value.is_floating_point() else value for name, value in values.items()}
 
 
-def assert_close(got: torch.Tensor, wanted: np.ndarray, relative: float) -> None:
+def assert_close(got: torch.Tensor, wanted: np.ndarray, relative: float):
     """Relative to the largest entry."""
     scale = float(np.abs(wanted).max()) or 1.0
     np.testing.assert_allclose(got.detach().double().numpy() / scale, wanted / scale, atol=relative, rtol=0)
 
 
-def test_gradients_of_many_points_are_equal_in_every_call_with_two_threads() -> None:
+def test_gradients_of_many_points_are_equal_in_every_call_with_two_threads():
     points = torch.rand(1, 40_000, 3, generator=torch.Generator().manual_seed(0)).expand(2, -1, -1)
     all_seen = torch.ones(points.shape[:2], dtype=torch.bool)
     loss, nodes = FrameLoss(points, all_seen, all_seen, 100, Losses(track=0.0)), points[0, :100].clone().requires_grad_()
@@ -64,7 +64,7 @@ def test_gradients_of_many_points_are_equal_in_every_call_with_two_threads() -> 
 
 
 @pytest.mark.parametrize("k", CASES)
-def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype) -> None:
+def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype):
     """Small errors, errors beyond 1 m, nothing visible: values and gradients of each term, and their sum."""
     c = case(golden, k, dtype)
     points, visible, valid = (torch.stack([c[name]] * 2) for name in ("gt", "visible", "motion_valid"))
@@ -79,13 +79,13 @@ def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype)
     assert_close(sum(terms.values()), golden[f"exp_total{k}"], tolerance(dtype))
 
 
-def test_ties_go_to_the_lowest_index() -> None:
+def test_ties_go_to_the_lowest_index():
     nodes = torch.tensor([[9.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])
     assert losses.nearest(torch.zeros(2, 3), nodes).tolist() == [1, 1]
     assert losses.nearest(torch.zeros(1, 3), nodes.flip(0)).tolist() == [0]
 
 
-def test_the_track_loss_is_linear_beyond_one_meter() -> None:
+def test_the_track_loss_is_linear_beyond_one_meter():
     nodes, seen = torch.tensor([[0.5, 2.0, 0.0]], requires_grad=True), torch.ones(2, 1, dtype=torch.bool)
     value = FrameLoss(torch.zeros(2, 1, 3), ~seen, seen, 1, Losses())(1, nodes)
     assert value.item() == pytest.approx((0.5**2 / 2 + 1.5) / 3)
@@ -93,7 +93,7 @@ def test_the_track_loss_is_linear_beyond_one_meter() -> None:
     np.testing.assert_allclose(nodes.grad, [[0.5 / 3, 1 / 3, 0.0]])
 
 
-def test_nothing_seen_is_zero_with_a_gradient() -> None:
+def test_nothing_seen_is_zero_with_a_gradient():
     nodes = torch.rand(4, 3, requires_grad=True)
     nobody = torch.zeros(2, 2, dtype=torch.bool)
     total = FrameLoss(torch.rand(2, 2, 3), nobody, nobody, 3, Losses())(1, nodes)
@@ -111,7 +111,7 @@ def frame_loss(*, frozen: bool = False, weights: Losses | None = None) -> tuple[
     return FrameLoss(points, visible, valid, 2, weights or Losses(), frozen), nodes
 
 
-def test_frames_use_their_visibility_and_the_motion_before() -> None:
+def test_frames_use_their_visibility_and_the_motion_before():
     loss, nodes = frame_loss()
     near, moved = loss.terms(1, nodes).values()
     assert near.item() == pytest.approx(0.01)
@@ -123,7 +123,7 @@ def test_frames_use_their_visibility_and_the_motion_before() -> None:
     assert loss(2, nodes).item() == pytest.approx(0.04 + 0.02 / 3)
 
 
-def test_frozen_counts_divide_by_frame_one() -> None:
+def test_frozen_counts_divide_by_frame_one():
     """Released quirk 4: frame 2 sees one point and one motion, but is divided by frame 1's two and two."""
     plain, nodes = frame_loss()
     frozen, _ = frame_loss(frozen=True)
@@ -132,7 +132,7 @@ def test_frozen_counts_divide_by_frame_one() -> None:
         assert got.item() == pytest.approx(wanted.item() / 2)
 
 
-def test_every_term_has_a_weight_of_its_name_and_a_weight_of_zero_leaves_it_out() -> None:
+def test_every_term_has_a_weight_of_its_name_and_a_weight_of_zero_leaves_it_out():
     assert set(losses.TERMS) == {spec.name for spec in fields(Losses)}
     for name in ("chamfer", "track"):
         loss, nodes = frame_loss(weights=replace(Losses(), **{name: 0.0}))
@@ -155,7 +155,7 @@ def height(loss: FrameLoss, state: losses.FrameState) -> torch.Tensor:
     return (state.x[:, 2] - 0.1).square().mean()
 
 
-def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch):
     """Search and fit follow: their costs of a rollout agree, with that of the term itself."""
     monkeypatch.setitem(losses.TERMS._own, "height", height)
     weights = Weights(chamfer=0.0, track=0.0, acceleration=0.0)

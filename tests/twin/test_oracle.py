@@ -41,7 +41,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def fitted(started: Path, output: Path, oracle: bool) -> None:
+def fitted(started: Path, output: Path, oracle: bool):
     before = {"observations": started / "observations.npz", "search": started / "search.json"}
     fit_stage(**before, settings=SETTINGS, kind="springs", device="cpu", output=output, oracle=oracle)
 

@@ -20,6 +20,7 @@ SINGLE_POSITIONS = 3e-6
 """Relative: lengths of 0.02 m between positions at 0.2 m in float32, whose rounding is 1.2e-8 m, at both ends of both lengths."""
 PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
+BY_RECORDING = config.SimulationSettings(rest_lengths="recording")
 
 
 def seen(path: str) -> Observations:
@@ -59,7 +60,7 @@ def test_costs_are_means_over_the_recordings():
 def test_springs_and_radii_are_the_same_on_all_recordings():
     """Lengths in spacings of the scenario's own body, whatever the poses of the others."""
     search_settings = replace(short(seen(LIFTED)).search, lengths="spacing")
-    alone = replace(short(seen(LIFTED)), search=search_settings)
+    alone = replace(short(seen(LIFTED)), search=search_settings, simulation=BY_RECORDING)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
     _, (here, there) = made(replace(alone, pool=(stretched,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
@@ -90,7 +91,7 @@ def pooled(problem: FitProblem, *pool: Observations, **options) -> FitResult:
     return fit(replace(problem, pool=pool), **options)
 
 
-def require_equal(one: FitResult, other: FitResult) -> None:
+def require_equal(one: FitResult, other: FitResult):
     """Raise AssertionError unless two fits are the same, bit for bit."""
     require_equal_twins(one.twin, other.twin)
     pd.testing.assert_frame_equal(one.history, other.history)
@@ -99,7 +100,7 @@ def require_equal(one: FitResult, other: FitResult) -> None:
     assert [one.facts.get(name) for name in moved] == [other.facts.get(name) for name in moved]
 
 
-def require_equal_twins(one: Twin, other: Twin) -> None:
+def require_equal_twins(one: Twin, other: Twin):
     """Raise AssertionError unless material, rest lengths and simulation are the same."""
     for name in ("stiffness", "dashpot"):
         np.testing.assert_array_equal(getattr(one.material, name), getattr(other.material, name))
@@ -112,7 +113,7 @@ def require_equal_twins(one: Twin, other: Twin) -> None:
 def test_recordings_share_one_material_and_one_unit():
     problem = problem_of(LIFTED, epochs=1)
     larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
-    run = TwinFit(replace(problem, pool=[larger]))
+    run = TwinFit(replace(problem, pool=[larger], simulation=BY_RECORDING))
     with torch.no_grad():
         run.parameters.offsets.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
     here, there = (run.parameters.physical(one.start) for one in run.recordings)

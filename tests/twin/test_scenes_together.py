@@ -46,7 +46,7 @@ def problems(collide: bool = False, **changes: object) -> list[SearchProblem]:
 
 
 @pytest.mark.parametrize("share", [False, True])
-def test_searches_of_several_scenes_end_as_each_alone(share: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_of_several_scenes_end_as_each_alone(share: bool, monkeypatch: pytest.MonkeyPatch):
     """In turns, as on a CPU, or with shared launches, as on a GPU."""
     given, sizes = problems(collide=share), []
     assert len({len(one.observations.nodes) for one in given}) == 2
@@ -60,7 +60,7 @@ def test_searches_of_several_scenes_end_as_each_alone(share: bool, monkeypatch: 
     assert max(sizes) >= 3 if share else set(sizes) == {1}
 
 
-def test_a_search_that_fails_does_not_stop_the_others() -> None:
+def test_a_search_that_fails_does_not_stop_the_others():
     good, other, _ = problems()
     bad = replace(other, simulation=SimulationSettings(substeps=1))
     together = search_many([SearchRun(good, 0), SearchRun(bad, 0)])
@@ -82,7 +82,7 @@ def together(given: Sequence[FitProblem], tasks: Sequence[FitTask] = ()) -> list
     return lockstep(courses, SharedFrames().serve)
 
 
-def test_fits_of_several_scenes_end_as_each_alone() -> None:
+def test_fits_of_several_scenes_end_as_each_alone():
     given = fits()
     for got, problem in zip(together(given), given, strict=True):
         small.assert_same_fit(got, fit(problem))
@@ -103,7 +103,7 @@ def several() -> list[FitProblem]:
 
 
 @pytest.mark.slow
-def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Whatever the others do: more substeps, another horizon, an earlier end, an error. Each continues from its checkpoint."""
     problems = several()
     alone = [fit(problem) for problem in problems]
@@ -122,7 +122,7 @@ def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("factor", [1e-9, 2.0])
-def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fit_module, "ADJOINT_LIMIT", factor)
     base = small.fit_problem()
     problems = [replace(base, fit=replace(base.fit, horizon=0, learning_rate=rate)) for rate in (1e-2, 5e-2)]
@@ -132,7 +132,7 @@ def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, m
         assert got.facts["frames_left_out"] == wanted.facts["frames_left_out"] > 0
 
 
-def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch):
     """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
     frames: list[int] = []
     original = FrameSolver.forward
@@ -148,7 +148,7 @@ def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("collide", [False, True])
-def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bool) -> None:
+def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bool):
     """The way of a GPU; there an atomic sum of contacts may round in another order."""
     twins = [candidate(problem, small.start_values()) for problem in problems(collide)[:2]]
     union = Union([twin.topology for twin in twins])
@@ -174,7 +174,7 @@ def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bo
 
 
 @pytest.mark.parametrize("device", [pytest.param("cuda:0", marks=CUDA)])
-def test_searches_and_fits_share_launches_on_a_gpu(device: str) -> None:
+def test_searches_and_fits_share_launches_on_a_gpu(device: str):
     """The first generation of each search judges what it does alone."""
     given = problems(device=device)
     together = search_many([SearchRun(one, 0) for one in given])

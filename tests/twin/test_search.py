@@ -200,7 +200,7 @@ def test_the_best_evaluated_candidate_wins_within_the_budget():
     assert small.judge(problem, [result.twin], loss) == [Outcome(result.cost, 0, 0)]
 
 
-def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def die_after(evaluated: int, problem: SearchProblem, seed: int, record: Path, monkeypatch: pytest.MonkeyPatch):
     """Interrupt a search while it evaluates one more candidate."""
     calls = 0
     evaluate = candidates.made

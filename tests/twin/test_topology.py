@@ -35,7 +35,7 @@ def same(nodes: np.ndarray, radius: float, neighbors: int) -> np.ndarray:
     return graphs.object_springs(nodes, np.full(len(nodes), radius), np.full(len(nodes), neighbors))
 
 
-def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
+def test_springs_and_rest_lengths_are_those_of_the_rest_shape():
     nodes, hands = cloud(1, 12), cloud(2, 2) + 2
     shape = np.concatenate([cloud(3, 12), cloud(4, 2)])
     labels = (np.arange(12) % 2).astype(np.int32)
@@ -53,7 +53,7 @@ def test_springs_and_rest_lengths_are_those_of_the_rest_shape() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_golden_springs(name: str) -> None:
+def test_golden_springs(name: str):
     """The same set of springs as the released code builds from the same points, and the same rest lengths."""
     c = clip(name)
     recorded = c.twin.topology
@@ -85,14 +85,14 @@ def brute(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> set[t
 
 @settings(max_examples=60, deadline=None)
 @given(seed=seeds, count=st.integers(1, 30))
-def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: int) -> None:
+def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: int):
     """Also with a radius and a count of its own for every node, as piecewise topologies have."""
     rng, nodes = np.random.default_rng(seed), cloud(seed, count)
     radius, neighbors = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
     assert undirected(graphs.object_springs(nodes, radius, neighbors)) == brute(nodes, radius, neighbors)
 
 
-def test_the_radius_is_strict() -> None:
+def test_the_radius_is_strict():
     nodes = np.array([[0.0, 0, 0], [0.5, 0, 0]])
     assert len(same(nodes, 0.5, 5)) == 0
     assert len(same(nodes, np.nextafter(0.5, 1), 5)) == 1
@@ -110,7 +110,7 @@ def blocks(counts: tuple[int, ...] = (6, 9, 4)) -> np.ndarray:
     return np.concatenate(groups[::-1])
 
 
-def test_regions_are_found_and_numbered_by_centroid() -> None:
+def test_regions_are_found_and_numbered_by_centroid():
     assert graphs.regions(blocks(), 3).tolist() == [2] * 4 + [1] * 9 + [0] * 6
 
 
@@ -130,7 +130,7 @@ def lattices() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("count", [2, 5, 8])
 @pytest.mark.parametrize("name", lattices())
-def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str, count: int) -> None:
+def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str, count: int):
     """On a lattice nearly all merges are ties: Ward's method alone agrees with itself by an adjusted Rand index of 0.3."""
     nodes = lattices()[name].astype(np.float32)
     labels, rng = graphs.regions(nodes, count), np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str,
 
 @settings(max_examples=20, deadline=None)
 @given(seed=seeds, repair=st.booleans())
-def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, repair: bool) -> None:
+def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, repair: bool):
     nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
     order = np.random.default_rng(seed + 2).permutation(25)
     # The last region asks for so little that some nodes are left alone, which `repair` then joins.
@@ -166,7 +166,7 @@ def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: i
     assert [renamed[pair] for pair in springs] == pytest.approx(list(springs.values()), rel=LENGTH)
 
 
-def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
+def test_a_spring_across_a_border_exists_if_either_side_asks():
     nodes, nobody = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]), np.array([[0.0, 9, 0]])
     labels = np.array([0, 0, 1, 1], np.int32)
 
@@ -183,7 +183,7 @@ def test_a_spring_across_a_border_exists_if_either_side_asks() -> None:
 # Where the springs of controllers have no force -----------------------------------------------------------------------
 
 
-def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_rest_shape() -> None:
+def test_calibrated_controller_springs_rest_in_frame_0_and_body_springs_in_the_rest_shape():
     nodes, hands, one = cloud(3), cloud(4, 3), np.zeros(25, np.int32)
     rest_shape = np.concatenate([cloud(5), cloud(6, 3)])
     plain, calibrated = (
@@ -208,7 +208,7 @@ def pieces(count: int, springs: np.ndarray) -> int:
     return connected_components(coo_array((np.ones(len(springs)), springs.T), shape=(count, count)), directed=False)[0]
 
 
-def test_a_node_without_a_spring_asks_for_its_nearest_nodes_behind_the_springs_that_are_there() -> None:
+def test_a_node_without_a_spring_asks_for_its_nearest_nodes_behind_the_springs_that_are_there():
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2.1, 0, 0], [4.6, 0, 0]])
     mended = graphs.joined(nodes, TWO)
     assert mended.tolist() == [[0, 1], [2, 1], [3, 2], [3, 1], [3, 0]]
@@ -216,7 +216,7 @@ def test_a_node_without_a_spring_asks_for_its_nearest_nodes_behind_the_springs_t
     np.testing.assert_array_equal(graphs.joined(nodes[:3], TWO), TWO, err_msg="it is one piece")
 
 
-def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
+def test_a_part_behind_a_gap_is_joined_along_its_seam():
     """Two sheets of 8 x 3 and 8 x 2 nodes, 1 apart, with a gap of 2.5: two rows are within a spacing of the gap."""
     large, small = (
         np.stack(np.meshgrid(np.arange(8.0), row, [0.0], indexing="ij"), -1).reshape(-1, 3) for row in ([0, 1, 2], [4.5, 5.5])
@@ -233,7 +233,7 @@ def test_a_part_behind_a_gap_is_joined_along_its_seam() -> None:
     assert len(seam) == graphs.REPAIR_SPRINGS * len(small)
 
 
-def test_many_parts_become_one_whatever_is_near_to_what() -> None:
+def test_many_parts_become_one_whatever_is_near_to_what():
     """Pairs that are nearer to each other than to the body join first, and then the body."""
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [20, 0, 0], [21, 0, 0], [23, 0, 0], [24, 0, 0]])
     assert pieces(8, graphs.joined(nodes, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [6, 7]]))) == 1

@@ -27,7 +27,7 @@ def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **ch
 
 
 @pytest.mark.parametrize("jolt", [0.0, 0.05])
-def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt: float) -> None:
+def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt: float):
     rod = make.clamped(
         9, damping=0.01, curvature=np.full((9, 2), 0.1), tilts=np.array([[0.1, -0.2], [0, 0]]), clamps=np.full((2, 3), 0.01)
     )
@@ -53,7 +53,7 @@ def elastica(length: float, bending: float, weight: float) -> np.ndarray:
     return np.array([np.trapezoid(np.cos(theta), s), -np.trapezoid(np.sin(theta), s)])
 
 
-def test_a_rod_at_rest_is_the_elastica() -> None:
+def test_a_rod_at_rest_is_the_elastica():
     wanted, apart = elastica(make.LENGTH, 0.1, 9.8), []
     for vertices in (9, 17, 33):
         rod = make.clamped(vertices, bending=0.1, stretching=1e6)
@@ -66,7 +66,7 @@ def test_a_rod_at_rest_is_the_elastica() -> None:
     assert np.log2(apart[1] / apart[2]) == pytest.approx(2, abs=0.25)
 
 
-def test_a_rod_at_rest_stays_and_lanes_do_not_mix() -> None:
+def test_a_rod_at_rest_stays_and_lanes_do_not_mix():
     rods = [make.clamped(9, bending=each, curvature=np.full((9, 2), 0.05)) for each in (0.01, 0.05)]
     x, m1, axes = hanging(rods, np.stack([make.JAWS, make.JAWS + 1.0]), make.simulation(gravity=9.8))
     np.testing.assert_allclose(hanging(rods[1:], make.JAWS[None] + 1.0, make.simulation(gravity=9.8))[0][0], x[1], atol=1e-12)

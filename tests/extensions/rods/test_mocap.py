@@ -32,7 +32,7 @@ def helix(count: int = 12) -> np.ndarray:
     return np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.3 + 0.3 * angle / angle[-1]], axis=1)
 
 
-def test_a_straightened_cable_keeps_its_arc_lengths() -> None:
+def test_a_straightened_cable_keeps_its_arc_lengths():
     markers, nodes = mocap.straightened(helix(), number=20, radius=0.006, count=4)
     length = np.hypot(0.2 * 1.6 * np.pi, 0.3)
     np.testing.assert_allclose(markers[:, 0], np.linspace(0, length, 12), rtol=0, atol=SPLINE * length)
@@ -56,7 +56,7 @@ def write(tmp_path: Path, value: Any) -> Path:
 
 
 @pytest.mark.parametrize("as_lists", [True, False], ids=["lists, as released", "array"])
-def test_markers_and_time(tmp_path: Path, as_lists: bool) -> None:
+def test_markers_and_time(tmp_path: Path, as_lists: bool):
     data = recording()
     path = write(tmp_path, data.tolist() if as_lists else data)
     observations = mocap.read(ROW, path, Mocap(stride=2))
@@ -76,7 +76,7 @@ def test_markers_and_time(tmp_path: Path, as_lists: bool) -> None:
     assert "stride=2" in scenario.provenance["options"]
 
 
-def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame_0(tmp_path: Path) -> None:
+def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame_0(tmp_path: Path):
     data = recording()
     # The ends turn too, so that points of clamps have velocities of their own.
     data[:, :, :2] += 0.01 * np.sin(np.linspace(0, 3, 40))[:, None, None] * np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.5]])
@@ -94,7 +94,7 @@ def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame
     assert len(mocap.read(ROW, write(tmp_path, data), Mocap()).velocity_before) == 0
 
 
-def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_path: Path) -> None:
+def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_path: Path):
     path = write(tmp_path, recording())
     seen = mocap.read(ROW, path, Mocap(start=1, stride=1, frames=39, train_fraction=1.0))
     assert (seen.scenario.frame_count, seen.scenario.train_end) == (39, 39)
@@ -116,7 +116,7 @@ def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_pat
         (recording()[:, :, [0, 1, 2, 2, 4, 5, 6, 7]], r"markers 2 and 3"),
     ],
 )
-def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) -> None:
+def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str):
     path = write(tmp_path, value)
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, path, Mocap())
@@ -124,14 +124,14 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str) ->
 
 
 @pytest.mark.parametrize(("settings", "message"), [(Mocap(stride=20), "stride = 20"), (Mocap(start=37), "mocap.start = 37")])
-def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, message: str) -> None:
+def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, message: str):
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, write(tmp_path, recording()), settings)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 @pytest.mark.parametrize(("cable", "observed"), [("DLO1", 9), ("DLO2", 8), ("DLO3", 8), ("DLO4", 8)])
-def test_released_recordings(cable: str, observed: int) -> None:
+def test_released_recordings(cable: str, observed: int):
     file = min((REAL / cable / "train").glob("*.pkl"))
     assert [d for d in check_layout(file) if d.level != "note"] == []
     observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, Mocap())
@@ -170,7 +170,7 @@ def clamp_rings(held: np.ndarray) -> np.ndarray:
     return mocap.clamps(held, normals, RADIUS, COUNT, "cable").reshape(len(held), 4, COUNT, 3)
 
 
-def test_points_keep_their_distance_to_the_marker_and_lie_normal_to_the_end() -> None:
+def test_points_keep_their_distance_to_the_marker_and_lie_normal_to_the_end():
     held = wild()
     offsets = clamp_rings(held) - held[:, :, None]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=3), RADIUS, rtol=0, atol=CLAMP_EDGE)
@@ -184,7 +184,7 @@ def test_points_keep_their_distance_to_the_marker_and_lie_normal_to_the_end() ->
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.7, np.pi / 2])
-def test_a_planar_motion_turns_the_normal_in_the_plane_by_the_same_angle(roll: float) -> None:
+def test_a_planar_motion_turns_the_normal_in_the_plane_by_the_same_angle(roll: float):
     angle = 1.2 * np.sin(np.linspace(0, 7, 300))
     out_of_plane = np.array([0.0, 1.0, 0.0])
     in_plane = turning(angle + np.pi / 2)
@@ -192,7 +192,7 @@ def test_a_planar_motion_turns_the_normal_in_the_plane_by_the_same_angle(roll: f
     np.testing.assert_allclose(mocap.transport(turning(angle), expected[0]), expected, atol=CLAMP_EDGE)
 
 
-def test_a_direction_that_goes_around_a_circle_of_latitude_turns_the_normal_by_the_enclosed_solid_angle() -> None:
+def test_a_direction_that_goes_around_a_circle_of_latitude_turns_the_normal_by_the_enclosed_solid_angle():
     # Parallel transport along a closed curve on the sphere: by Gauss-Bonnet it turns by the area 2 pi (1 - cos(polar angle)).
     polar, steps = 0.4, 20_000
     turn = np.linspace(0, 2 * np.pi, steps)
@@ -204,7 +204,7 @@ def test_a_direction_that_goes_around_a_circle_of_latitude_turns_the_normal_by_t
     assert angle % (2 * np.pi) == pytest.approx(2 * np.pi * (1 - np.cos(polar)), abs=1e-6)
 
 
-def test_markers_of_an_end_that_meet_are_refused() -> None:
+def test_markers_of_an_end_that_meet_are_refused():
     held = wild()
     held[7, 3] = held[7, 2]
     with pytest.raises(InputError, match=r"two held markers.*sample 7"):
@@ -223,14 +223,14 @@ def read(folder: Path, **settings: object) -> mocap.Observations:
     return mocap.read(ROW, write(folder, cable()), Mocap(**settings))  # type: ignore[arg-type]
 
 
-def test_clamps_follow_the_markers_among_the_controllers(tmp_path: Path) -> None:
+def test_clamps_follow_the_markers_among_the_controllers(tmp_path: Path):
     clamped = read(tmp_path)
     assert clamped.controller_points.shape == (21, 4 + 4 * 3, 3)
     offsets = clamped.controller_points[:, 4:].reshape(21, 4, 3, 3) - clamped.controller_points[:, :4, None]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=3), 0.006, atol=SINGLE)
 
 
-def test_a_clamp_turns_as_it_does_at_the_full_rate_and_does_not_know_later_frames(tmp_path: Path) -> None:
+def test_a_clamp_turns_as_it_does_at_the_full_rate_and_does_not_know_later_frames(tmp_path: Path):
     every, second = read(tmp_path, stride=1), read(tmp_path, stride=2)
     np.testing.assert_array_equal(every.controller_points[::2], second.controller_points)
     first = read(tmp_path, stride=2, frames=9)

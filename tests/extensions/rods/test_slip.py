@@ -47,13 +47,13 @@ def energy(body: Rod, solver: RodSolver) -> float:
     return make.stored(solver) + float((mass * solver.v[0].square().sum(1)).sum() / 2)
 
 
-def test_a_joint_goes_round_masings_loop_and_turns_as_it_slips() -> None:
+def test_a_joint_goes_round_masings_loop_and_turns_as_it_slips():
     most, largest = 1e-3, 4e-3
     body = make.rod(make.straight(3, 2.0), (0, 1, 2), axis=np.array([0.0, 0.0, 1.0]), slip=[[0.5, most]])
     solver = started([body])
     rows = []
 
-    def go(y: float, z: float, steps: int = 1) -> None:
+    def go(y: float, z: float, steps: int = 1):
         begin = solver.x.clone()
         for part in np.arange(1, steps + 1) / steps:
             end = begin.clone()
@@ -74,7 +74,7 @@ def test_a_joint_goes_round_masings_loop_and_turns_as_it_slips() -> None:
     assert float(e.norm()) == pytest.approx(most, rel=1e-9)
 
 
-def test_what_never_slips_is_a_stiffer_rod_and_what_always_slips_is_none() -> None:
+def test_what_never_slips_is_a_stiffer_rod_and_what_always_slips_is_none():
     stiff = {"bending": 3e-3, "twisting": 3e-3}
     plain = make.rod(make.crooked(7), (0, 1), **LIVELY | {"damping": 0.0, "curvature": np.zeros((7, 2))})
     # Unloaded in frame 0, as its branches are.
@@ -93,7 +93,7 @@ def test_what_never_slips_is_a_stiffer_rod_and_what_always_slips_is_none() -> No
 
 
 @pytest.mark.parametrize("branches", [BRANCHES, np.array([[3.0, 0.05]])])
-def test_energy_never_grows_even_where_modes_are_fast_for_a_substep(branches: np.ndarray) -> None:
+def test_energy_never_grows_even_where_modes_are_fast_for_a_substep(branches: np.ndarray):
     """A foam of 1.9 m, EI / m = 10 m^4/s^2, with 33 vertices: its fastest mode turns by 28 rad per substep of 8 ms."""
     count, length = 33, 1.9
     spacing = length / (count - 1.5)
@@ -120,9 +120,7 @@ def beam(vertices: int, bending: float, **changes: Any) -> Rod:
 # What the end of the bent beam is off, of its length, times squared edges: angles are better than 2 tan of their half.
 @pytest.mark.parametrize(("by_angle", "off"), [(0.0, 0.58), (1.0, 0.29)])
 @pytest.mark.parametrize("vertices", [9, 17])
-def test_a_beam_is_the_elastica_and_swings_as_theory_says_with_any_number_of_vertices(
-    vertices: int, by_angle: float, off: float
-) -> None:
+def test_a_beam_is_the_elastica_and_swings_as_theory_says_with_any_number_of_vertices(vertices: int, by_angle: float, off: float):
     load = 5.0
     solver = started([beam(vertices, 1 / load, damping=0.5, by_angle=by_angle)], frame_time=0.2, gravity=1.0)
     for _ in range(300):

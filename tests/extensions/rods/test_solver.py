@@ -52,7 +52,7 @@ def shaken(frames: int, vertices: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("held", "damping"), [((0, 1, 5, 6), 0.0), ((0, 1, 5, 6), 0.01), ((0, 1), 0.01), ((0, 6), 0.01), ((), 0.01)]
 )
-def test_steps_converge_with_second_order(held: tuple[int, ...], damping: float) -> None:
+def test_steps_converge_with_second_order(held: tuple[int, ...], damping: float):
     body = make.rod(make.crooked(7), held, damping=damping, **LIVELY)
     hands, v, options = shaken(2, 7), make.real([0.2, -0.1, 0.3]), {"frame_time": 0.005, "gravity": 9.8}
     coarse, middle, fine = (roll_out([body], hands, v, 0.5, substeps=n, **options)[-1, 0] for n in (10, 20, 40))
@@ -60,7 +60,7 @@ def test_steps_converge_with_second_order(held: tuple[int, ...], damping: float)
 
 
 @pytest.mark.parametrize("by_angle", [0.0, 1.0])
-def test_at_rest_the_energy_is_least(by_angle: float) -> None:
+def test_at_rest_the_energy_is_least(by_angle: float):
     """Derivatives of the energy that is written down here, by finite differences, balance the weight."""
     stiff = {"bending": 0.1, "twisting": 0.05, "stretching": 1e3, "damping": 0.02, "by_angle": by_angle}
     body = make.rod(make.crooked(7), (0, 1, 5, 6), **LIVELY | stiff)
@@ -73,7 +73,7 @@ def test_at_rest_the_energy_is_least(by_angle: float) -> None:
         assert (above - below) / 2e-6 == pytest.approx(-weight * (axis == 2), abs=1e-4 * weight)
 
 
-def test_lanes_are_the_same_alone_and_in_company() -> None:
+def test_lanes_are_the_same_alone_and_in_company():
     rods = [
         make.rod(make.crooked(7, seed=seed), (0, 1, 5, 6), bending=10.0**-seed, damping=0.01 * seed, **LIVELY) for seed in range(3)
     ]
@@ -83,7 +83,7 @@ def test_lanes_are_the_same_alone_and_in_company() -> None:
         assert torch.equal(together[:, lane], roll_out([body], hands, gravity=9.8)[:, 0])
 
 
-def test_clamps_keep_their_directors_to_the_axis() -> None:
+def test_clamps_keep_their_directors_to_the_axis():
     body = make.rod(make.crooked(7), (0, 1, 5, 6), **LIVELY)
     solver = solver_of([body], gravity=9.8)
     path = make.real(body.vertices) + 5 * make.real(shaken(5, 7))
@@ -96,7 +96,7 @@ def test_clamps_keep_their_directors_to_the_axis() -> None:
     assert np.arctan2(np.cross(last, directors[1]) @ t[1], last @ directors[1]) == pytest.approx(body.roll)
 
 
-def test_a_free_rod_keeps_its_momentum() -> None:
+def test_a_free_rod_keeps_its_momentum():
     """Linear momentum exactly, angular momentum with the order of the scheme."""
     body = make.rod(make.crooked(7), (), damping=0.01, stretching=20.0, curvature=LIVELY["curvature"])
     v = make.real(np.random.default_rng(3).normal(0, 0.3, (7, 3)))
@@ -112,7 +112,7 @@ def test_a_free_rod_keeps_its_momentum() -> None:
     assert np.log2(gains[0] / gains[1]) == pytest.approx(2, abs=0.2)
 
 
-def test_a_stiff_rod_on_a_hinge_is_a_pendulum() -> None:
+def test_a_stiff_rod_on_a_hinge_is_a_pendulum():
     body = make.rod(make.straight(5, 0.5, (0, 0, -1)), (0,), bending=1e4, twisting=1e4, stretching=1e6)
     away, mass = -body.vertices[:, 2], body.mass
     frequency = np.sqrt(9.8 * (mass @ away) / (mass @ away**2))
@@ -128,7 +128,7 @@ def test_a_stiff_rod_on_a_hinge_is_a_pendulum() -> None:
         assert float(x[20 * half]) / amplitude == pytest.approx((-1) ** half * -delay, rel=0.1)
 
 
-def test_a_column_swings_below_its_buckling_load_and_grows_above() -> None:
+def test_a_column_swings_below_its_buckling_load_and_grows_above():
     """Exact for small w = w0(t) sin(pi x): w0'' = -w^2 (1 - load / buckling load) w0, of segments too."""
     segments, shares, speed = 6, (0.5, 1.5), 1e-4
     rods = [make.column(segments, share * make.buckling_load(segments), stretching=1e5) for share in shares]
@@ -143,7 +143,7 @@ def test_a_column_swings_below_its_buckling_load_and_grows_above() -> None:
     np.testing.assert_allclose(x[:, 1], growth, atol=1e-3 * float(growth[-1]))
 
 
-def test_twist_makes_a_straight_rod_unstable() -> None:
+def test_twist_makes_a_straight_rod_unstable():
     """Of Greenhill's moment, 1.035 times with eight segments."""
     rods = [make.twisted(8, share * 1.035 * make.GREENHILL) for share in (0.9, 1.1)]
     nudge = 1e-3 * np.sin(np.pi * rods[0].vertices[:, 0])
@@ -155,7 +155,7 @@ def test_twist_makes_a_straight_rod_unstable() -> None:
 
 @pytest.mark.parametrize("damping", [0.0, 0.02, 0.3])
 @pytest.mark.parametrize(("twisting", "substeps"), [(0.1, 5), (1.0, 5), (1.0, 1)])
-def test_the_stiffest_cable_is_stable(damping: float, twisting: float, substeps: int) -> None:
+def test_the_stiffest_cable_is_stable(damping: float, twisting: float, substeps: int):
     """EI = 1 N m^2 at 5 cm, in substeps of 2 and 10 ms: its highest frequency is 1,600 rad/s. It begins far from its rest shape."""
     curvature = np.random.default_rng(1).normal(0, 0.3, (9, 2))
     options: dict[str, Any] = {"bending": 1.0, "twisting": twisting, "stretching": 2e4, "damping": damping, "roll": 0.5}

@@ -237,7 +237,7 @@ def test_a_trial_is_judged_by_the_twin_that_the_tail_selects(folder, method, mon
 
 
 def test_hopeless_trials_are_pruned_before_their_last_epoch(folder, monkeypatch):
-    monkeypatch.setattr(twin_fit, "CHECK_EVERY", 1)
+    monkeypatch.setattr(twin_fit, "ROLLOUT_EVERY", 1)
     monkeypatch.setattr(worker, "pruner_of", lambda scenarios: worker.MedianPruner(n_startup_trials=1, n_warmup_steps=0))
     space = {"simulation.gravity": {"choices": [9.8, 80.0]}, "fit.learning_rate": {"choices": [1e-4, 1.1e-4]}}
     made = work(folder, sweep(trials=5, space=space))
