@@ -29,6 +29,8 @@ HAND_REACH = 0.06
 """m. A hand that never comes nearer to the object does not hold it. Where they touch, depth may be hidden."""
 HAND_RATIO = 12.0
 """Hands so many times as large as the object in the image are something else."""
+PLAUSIBLE = (0.02, 1.2)
+"""Longest side of an object, m."""
 COMPARED_POINTS, FEWEST_POINTS = 1500, 20
 """Points of object and hands that are compared, and points below which nothing is reported."""
 
@@ -132,16 +134,13 @@ def in_cm(sides: Iterable[float]) -> str:
 
 
 def size(place: Place) -> dict[str, Any] | None:
-    """Sides of the object and its heights above the table, in the first frame that shows it."""
+    """Sides of the object and its heights above the table, in the first frame that shows it; a warning beyond PLAUSIBLE."""
+    longest = np.median(np.ptp([*place.values()], axis=1), axis=0).max() if place else 0.0
+    level = "note" if PLAUSIBLE[0] <= longest <= PLAUSIBLE[1] else "warning"
     for frame, (low, high) in place.items():
         text = f"{in_cm(high - low)} cm, from {100 * low[2]:.1f} to {100 * high[2]:.1f} cm above the table in frame {frame}"
-        return {"value": in_cm(high - low), "text": text, "frames": (frame,)}
+        return {"value": in_cm(high - low), "text": text, "frames": (frame,), "level": level}
     return None
-
-
-def longest(place: Place) -> float | None:
-    """Median of the longest side of the object, m."""
-    return float(np.median(np.ptp([*place.values()], axis=1), axis=0).max()) if place else None
 
 
 def lowest(place: Place) -> dict[str, Any] | None:

@@ -10,7 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from neuspring.core.artifacts import Observations
+from neuspring.core.geometry import lean
 
+FIRST, SETTLED = 4, 0.005
+"""Frames in which an object at rest moves less than so many m."""
 GRIP = 0.04
 """m from the object within which a controller can hold it."""
 NO_INTERACTION = 0.15
@@ -81,6 +84,21 @@ def speed_of_hands(seen: Observed) -> dict[str, Any] | None:
         return None
     frame = int(speed.argmax())
     return OF_CONTROLLERS | {"value": float(speed.max()), "detail": f"after frame {frame}", "frames": (frame,)}
+
+
+def leaning(seen: Observed) -> dict[str, Any] | None:
+    """Angle, degrees, at which the object hangs at rest beside the vertical through its hands in frame 0."""
+    own = seen.observations
+    up, hands, points = (
+        own.scenario.up_sign,
+        own.controller_points[0],
+        own.object_points[:FIRST, own.object_visibility[:FIRST].all(axis=0)],
+    )
+    heights = up * own.nodes[:, 2]
+    hangs = heights.mean() < up * hands[:, 2].mean() - GRIP and heights.max() < up * hands[:, 2].max() + SETTLED
+    free = not own.scenario.ground or heights.min() > GRIP
+    still = points.size and np.linalg.norm(points - points[0], axis=2).max() < SETTLED
+    return {"value": float(np.degrees(np.linalg.norm(lean(own.nodes, hands, up))))} if hangs and free and still else None
 
 
 def motion_of_object(seen: Observed) -> dict[str, Any]:

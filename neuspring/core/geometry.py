@@ -23,6 +23,26 @@ def on_table(points: np.ndarray, up: float) -> np.ndarray:
     return lifted
 
 
+SPREAD = 0.05
+"""m between hands from which what hangs from them turns about the line through them alone."""
+
+
+def lean(points: np.ndarray, hands: np.ndarray, up: float) -> np.ndarray:
+    """Rotation vector [3], rad, after which the center of points [n, 3] is below the hands [C, 3] that it hangs from.
+
+    It is horizontal, and along the hands where they are SPREAD apart.
+    """
+    below = points.mean(axis=0) - hands.mean(axis=0)
+    sideways = hands[:, :2] - hands[:, :2].mean(axis=0)
+    axis = np.array([-below[1], below[0]])
+    if np.ptp(sideways @ (along := np.linalg.svd(sideways)[2][0])) > SPREAD:
+        axis = along
+    axis = np.append(axis / max(np.linalg.norm(axis), np.finfo(float).tiny), 0.0)
+    down = np.array([0.0, 0.0, -up])
+    across = np.cross(down, axis)
+    return np.asarray(axis * np.arctan2(below @ across, below @ down))
+
+
 def rigid_inverse(pose: np.ndarray) -> np.ndarray:
     """The inverse of a rigid motion [4, 4]."""
     inverse = np.eye(4)

@@ -72,6 +72,12 @@ class InSpace:
     annotated: np.ndarray
     """[T, K, 3], m, NaN where not annotated: all of them."""
 
+    def turned(self, rotation: np.ndarray) -> InSpace:
+        """All points after a rotation [3, 3] about the origin."""
+        hands = replace(self.hands, points=self.hands.points @ rotation.T) if self.hands else None
+        nodes, tracks, annotated = (points @ rotation.T for points in (self.nodes, self.tracks, self.annotated))
+        return InSpace(hands, nodes, tracks, annotated)
+
 
 def given(folder: Path, names: tuple[str, ...]) -> Path | None:
     """The file of a capture's folder with one of `names`; None without any. Raises InputError for two."""

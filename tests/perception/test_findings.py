@@ -129,7 +129,7 @@ BOX = np.random.default_rng(0).uniform((0, 0, 0), (0.1, 0.1, 0.1), (200, 3))
 
 def test_size_and_place_of_the_object_are_said():
     assert said(look_at_lifted(tracked(BOX), no_prior(), 1.0)) == {"note: size of the object"}
-    assert "warning: implausible size" in said(look_at_lifted(tracked(20.0 * BOX), no_prior(), 1.0))
+    assert "warning: size of the object" in said(look_at_lifted(tracked(20.0 * BOX), no_prior(), 1.0))
     below = "warning: object below the table"
     assert below in said(look_at_lifted(tracked(BOX - [0, 0, 0.06]), no_prior(), 1.0))
     # The same with z down: above and below are exchanged.

@@ -69,7 +69,7 @@ def test_a_mesh_in_any_pose_and_size_finds_its_place_wherever_the_object_lies(tm
 
 
 @pytest.fixture(scope="module")
-def toy() -> trimesh.Trimesh:
+def toy():
     """A flat animal with arms and legs, 0.3 m long, on the table z = 0: a closed surface."""
     parts = [ellipsoid((0, 0, 0.05), (0.085, 0.06, 0.045)), ellipsoid((0.12, 0, 0.06), (0.05, 0.05, 0.042))]
     for side in (1, -1):

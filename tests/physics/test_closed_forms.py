@@ -31,7 +31,7 @@ def sign(up: str) -> float:
 
 @SIDES
 @pytest.mark.parametrize("drag", [0.0, 3.0])
-def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: str):
+def test_free_fall_is_the_discrete_closed_form(engine, drag, up):
     """v_n = delta^n v_0 - s g dt,  x_n = x_0 + dt (s v_0 - g dt sum of partial sums),  s = delta + ... + delta^n."""
     substeps = 50
     body = scene(1, drag=drag, gravity=G, up=up, substeps=substeps, frame_time=0.1)
@@ -50,7 +50,7 @@ def test_free_fall_is_the_discrete_closed_form(engine: Engine, drag: float, up: 
 # Masses ----------------------------------------------------------------------------------------------------------------
 
 
-def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engine: Engine):
+def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engine):
     """Of two nodes of 0.5 and 2 kg on a spring: q'' = -(Y / l0) (1/m_1 + 1/m_2) q, and m_1 v_1 + m_2 v_2 stays."""
     mass, dt, steps = np.array([0.5, 2.0]), 1e-3, 200
     body = scene(2, [(0, 1)], [0.2], stiffness=50.0, mass=mass, frame_time=dt)
@@ -63,7 +63,7 @@ def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engin
     assert q.min() < -0.019
 
 
-def test_nodes_of_other_mass_collide_with_their_momentum(engine: Engine):
+def test_nodes_of_other_mass_collide_with_their_momentum(engine):
     """Head on: m_1 v_1 + m_2 v_2 stays, and the relative velocity becomes -e times what it was."""
     mass, start = np.array([0.5, 2.0]), np.array([[1.0, 0, 0], [-0.5, 0, 0]])
     body = scene(2, mass=mass, contact=(0.6, 0.3), contact_distance=0.02, self_collision=True)
@@ -92,7 +92,7 @@ def oscillate(
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.8])
-def test_oscillator_is_the_discrete_closed_form(engine: Engine, damping: float):
+def test_oscillator_is_the_discrete_closed_form(engine, damping):
     """q_{n+1} - (2 - c dt - w^2 dt^2) q_n + (1 - c dt) q_{n-1} = 0, so q_n = r^n (A cos n theta + B sin n theta)."""
     dt, c = PERIOD / 40, 2 * damping
     q, _ = oscillate(engine, dt, 400, dashpot=damping)
@@ -104,7 +104,7 @@ def test_oscillator_is_the_discrete_closed_form(engine: Engine, damping: float):
     np.testing.assert_allclose(q, r**n * (AMPLITUDE * np.cos(n * theta) + sine * np.sin(n * theta)), atol=ROUNDING)
 
 
-def test_oscillator_converges_at_first_order(engine: Engine):
+def test_oscillator_converges_at_first_order(engine):
     """Compared with A cos(w t) at 0.7 periods: the leading error is A (w dt / 2) sin(w t), and phase errors are still small."""
     steps, t = 300, 0.7 * PERIOD
     exact = AMPLITUDE * np.cos(np.sqrt(OMEGA_SQUARED) * t)
@@ -112,7 +112,7 @@ def test_oscillator_converges_at_first_order(engine: Engine):
     assert HALVING[0] < errors[0] / errors[1] < HALVING[1]
 
 
-def test_energy_is_bounded_without_damping(engine: Engine):
+def test_energy_is_bounded_without_damping(engine):
     """Symplectic: q'^2 + w^2 q^2 - dt w^2 q q' is conserved exactly, so the energy stays within w dt / 2 of its start."""
     dt = PERIOD / 60
     q, rate = oscillate(engine, dt, 60 * 100, per_frame=7)
@@ -127,7 +127,7 @@ def test_energy_is_bounded_without_damping(engine: Engine):
     assert energy[middle:].max() == pytest.approx(energy[:middle].max(), rel=1e-3)
 
 
-def test_energy_decays_with_a_dashpot(engine: Engine):
+def test_energy_decays_with_a_dashpot(engine):
     """Per period: monotone, at the rate of the discrete envelope, r^2 = 1 - c dt per substep."""
     gamma, per_frame = 0.3, 60
     dt = PERIOD / per_frame
@@ -152,7 +152,7 @@ def net(dashpot: float, frames: int = 20) -> tuple:
 
 
 @pytest.mark.parametrize("dashpot", [0.0, 2.0])
-def test_momentum_and_angular_momentum(engine: Engine, dashpot: float):
+def test_momentum_and_angular_momentum(engine, dashpot):
     """Springs and dashpots act along the line between their ends. Momentum is conserved, and so is angular momentum:
 
     x_{n+1} x v_{n+1} = (x_n + dt v_{n+1}) x v_{n+1} = x_n x (v_n + dt f_n), and central forces have no total moment.
@@ -164,7 +164,7 @@ def test_momentum_and_angular_momentum(engine: Engine, dashpot: float):
 
 
 @pytest.mark.parametrize(("e", "mu"), [(1.0, 0.0), (0.7, 0.3), (0.0, 2.0)])
-def test_a_colliding_pair(engine: Engine, e: float, mu: float):
+def test_a_colliding_pair(engine, e, mu):
     """Momentum is conserved, the normal speed is reversed times e, the tangential one shrinks by a."""
     body = scene(2, self_collision=True, contact=(e, mu), contact_distance=0.02, substeps=1, frame_time=1e-3)
     x = np.array([[0.0, 0, 0], [0.015, 0, 0]])
@@ -179,7 +179,7 @@ def test_a_colliding_pair(engine: Engine, e: float, mu: float):
         assert (after[1] ** 2).sum() == pytest.approx((v**2).sum(), rel=1e-14)
 
 
-def test_receding_or_distant_pairs_do_not_collide(engine: Engine):
+def test_receding_or_distant_pairs_do_not_collide(engine):
     body = scene(2, self_collision=True, contact_distance=0.02)
     v = np.array([[-0.1, 0, 0], [0.1, 0, 0]])
     near, far = np.array([[0.0, 0, 0], [0.015, 0, 0]]), np.array([[0.0, 0, 0], [0.02, 0, 0]])
@@ -188,7 +188,7 @@ def test_receding_or_distant_pairs_do_not_collide(engine: Engine):
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_dashpot_feels_the_speed_of_its_hand_only_if_hands_have_one(engine: Engine, moving: bool):
+def test_a_dashpot_feels_the_speed_of_its_hand_only_if_hands_have_one(engine, moving):
     """One substep from rest, with a spring that hardly pulls: v' = dt gamma V."""
     body = scene(1, [(1, 0)], [0.1], stiffness=1e-12, dashpot=2.0, controller_velocity=moving)
     hands = np.array([[[0.1, 0, 0]], [[0.1005, 0, 0]]])
@@ -201,7 +201,7 @@ def test_a_dashpot_feels_the_speed_of_its_hand_only_if_hands_have_one(engine: En
 
 @SIDES
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
-def test_restitution_is_exact_in_speed(engine: Engine, e: float, up: str):
+def test_restitution_is_exact_in_speed(engine, e, up):
     """One substep: reflected at the time of impact, then v' for the rest of the substep."""
     s, dt = sign(up), 1e-3
     body = scene(1, on_ground=True, ground=(e, 0.0), up=up)
@@ -212,7 +212,7 @@ def test_restitution_is_exact_in_speed(engine: Engine, e: float, up: str):
 
 
 @SIDES
-def test_bounce_height_is_e_squared(engine: Engine, up: str):
+def test_bounce_height_is_e_squared(engine, up):
     """Height of the n-th bounce: e^(2n) h, up to the distance fallen in a substep at full speed."""
     s, dt, height, e = sign(up), 2e-4, 0.1, 0.6
     body = scene(1, on_ground=True, ground=(e, 0.0), gravity=G, up=up, frame_time=dt)
@@ -224,7 +224,7 @@ def test_bounce_height_is_e_squared(engine: Engine, up: str):
 
 
 @SIDES
-def test_sliding_and_sticking(engine: Engine, up: str):
+def test_sliding_and_sticking(engine, up):
     """a = max(0, 1 - mu (1 + e) |v_n| / |v_t|): partly braked, or stopped when mu is large."""
     s, e, w = sign(up), 0.4, np.array([0.6, -0.8, -0.5 * sign(up)])
     for mu, a in ((0.0, 1.0), (0.3, 1 - 0.3 * 1.4 * 0.5), (2.0, 0.0)):
@@ -235,7 +235,7 @@ def test_sliding_and_sticking(engine: Engine, up: str):
 
 @SIDES
 @pytest.mark.parametrize("e", [0.0, 0.3, 1.0])
-def test_the_ground_holds(engine: Engine, e: float, up: str):
+def test_the_ground_holds(engine, e, up):
     """From above nothing goes deeper than a node slower than APPROACH can travel in the substep in which it is let pass."""
     rng, s, dt = np.random.default_rng(2), sign(up), 1e-3
     body = scene(40, on_ground=True, ground=(e, 0.2), gravity=G, up=up, frame_time=dt)

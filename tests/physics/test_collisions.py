@@ -75,7 +75,7 @@ def listed(solver: FrameSolver, twin: int) -> list[list[int]]:
 
 @pytest.mark.parametrize(("device", "threads"), WAYS)
 @pytest.mark.parametrize("capacity", [1, 5, 500])
-def test_full_lists_are_reported_and_never_overrun(capacity: int, device: str, threads: bool):
+def test_full_lists_are_reported_and_never_overrun(capacity, device, threads):
     """Every list holds those of the first `capacity` partners in node order who list the node as well."""
     x = clump(7, 4)
     partners, overflow = lists(x, capacity, frames=3, device=device, threads=threads)
@@ -140,7 +140,7 @@ CLOUDS = ("around the origin", "far away", "cell borders", "far cell borders", "
 
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
 @pytest.mark.parametrize("kind", CLOUDS)
-def test_the_grid_finds_all_pairs(kind: str, dtype: torch.dtype):
+def test_the_grid_finds_all_pairs(kind, dtype):
     x = cloud(kind)
     wanted = expected(x, dtype, DISTANCE)
     assert sum(map(len, wanted)) > len(x)
@@ -162,7 +162,7 @@ def crowds(count: int, nodes: int = 24) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("capacity", [1, 5, 50])
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-def test_a_crowded_twin_takes_no_room_from_others(dtype: torch.dtype, capacity: int):
+def test_a_crowded_twin_takes_no_room_from_others(dtype, capacity):
     """Twins whose crowds are other nodes fill one list far beyond what one of them may keep."""
     clouds = crowds(17)
     clouds[2][:20] = np.random.default_rng(2).uniform(-0.004, 0.004, (20, 3))
@@ -187,7 +187,7 @@ def test_contact_distances_are_those_of_each_twin():
 
 @pytest.mark.parametrize("apart", [0.0, 0.2, 0.49, 0.51, 3.0])
 @pytest.mark.parametrize("dtype", [SINGLE, DOUBLE])
-def test_twins_that_are_alike_share_a_search(dtype: torch.dtype, apart: float):
+def test_twins_that_are_alike_share_a_search(dtype, apart):
     """Nodes up to `apart` contact distances from those of the first twin, and whole bodies anywhere: all pairs are found."""
     rng = np.random.default_rng(5)
     x = cloud("around the origin")

@@ -121,13 +121,13 @@ def node_error(x: np.ndarray, expected: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", DRAWN)
-def test_positions_follow_the_record_over_the_whole_clip(name: str, dtype: torch.dtype, device: str):
+def test_positions_follow_the_record_over_the_whole_clip(name, dtype, device):
     x, _ = rollout(name, device, dtype, True, False)
     assert node_error(x, clip(name).x).max() < POSITION
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_the_reference_follows_the_record(name: str):
+def test_the_reference_follows_the_record(name):
     c = clip(name)
     x, _ = reference.rollout(ReferenceTwin.of(c.twin), c.x[0], c.v[0], c.controllers)
     assert node_error(x, c.x).max() < POSITION
@@ -135,7 +135,7 @@ def test_the_reference_follows_the_record(name: str):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_cloth_follows_the_record_frame_by_frame(dtype: torch.dtype, device: str):
+def test_cloth_follows_the_record_frame_by_frame(dtype, device):
     x, _ = rollout("cloth_selfcollision", device, dtype, True, True)
     error = node_error(x, clip("cloth_selfcollision").x)
     assert np.median(error, axis=1).max() < CLOTH_MEDIAN
@@ -145,7 +145,7 @@ def test_cloth_follows_the_record_frame_by_frame(dtype: torch.dtype, device: str
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", NAMES)
-def test_forward_only_equals_differentiable(name: str, device: str):
+def test_forward_only_equals_differentiable(name, device):
     """Few substep slots or all of them: the same numbers, bit for bit."""
     differentiable, free = (rollout(name, device, torch.float32, mode, name not in DRAWN) for mode in (True, False))
     for a, b in zip(differentiable, free, strict=True):
@@ -153,7 +153,7 @@ def test_forward_only_equals_differentiable(name: str, device: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_thread_per_node_gives_what_one_thread_gives(name: str):
+def test_a_thread_per_node_gives_what_one_thread_gives(name):
     """The kernels of a GPU, run on the CPU, follow the record as far as the others do: positions bit for bit, and gradients."""
     positions = (rollout(name, "cpu", torch.float32, True, name not in DRAWN, threads) for threads in (None, True))
     for a, b in zip(*positions, strict=True):
@@ -171,7 +171,7 @@ def test_a_thread_per_node_gives_what_one_thread_gives(name: str):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", NAMES)
-def test_losses_and_gradients_of_restarted_frames(name: str, dtype: torch.dtype, device: str):
+def test_losses_and_gradients_of_restarted_frames(name, dtype, device):
     if name in DRAWN or dtype == torch.float32:
         check_frames(clip(name), optimized_frames(name, device, dtype, True))
 
@@ -194,7 +194,7 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", DRAWN)
-def test_losses_along_the_rollout(name: str, device: str):
+def test_losses_along_the_rollout(name, device):
     """Without restarts, as the released stages run: state carried on and detached."""
     c, frames = clip(name), optimized_frames(name, device, torch.float32, False)
     np.testing.assert_allclose([frame.losses[3] for frame in frames.values()], c.losses[:, 3], rtol=CLIP_LOSS)

@@ -45,7 +45,7 @@ def check(
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_gradients_of_a_frame(variant: str):
+def test_gradients_of_a_frame(variant):
     """Six nodes in all terms at once. The seed is one for which a step of the differences flips no contact."""
     body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, **VARIANTS[variant])
     found = check(body, x, v, waypoints(torch.tensor(hands)))
@@ -66,7 +66,7 @@ def test_gradients_of_a_frame(variant: str):
         (4e-4, (1.3, -0.9, -0.8), 0.01, (True, True)),  # slides almost without friction
     ],
 )
-def test_gradients_at_the_ground(height: float, speed: tuple, friction: float, felt: tuple, up: str):
+def test_gradients_at_the_ground(height, speed, friction, felt, up):
     flip = np.array([1.0, 1.0, 1.0 if up == "+z" else -1.0])
     body = scene(1, on_ground=True, ground=(0.6, friction), drag=2.0, up=up)
     # Where it falls straight the tangential speed has a kink.
@@ -77,7 +77,7 @@ def test_gradients_at_the_ground(height: float, speed: tuple, friction: float, f
 
 @pytest.mark.parametrize("threads", [False, True])
 @pytest.mark.parametrize("friction", [0.01, 0.1, 0.9, 1.99])
-def test_gradients_in_a_crowd(friction: float, threads: bool):
+def test_gradients_in_a_crowd(friction, threads):
     """Nodes of several masses, each with several partners; with much friction some stick."""
     rng = np.random.default_rng(11)
     x = rng.uniform(-0.012, 0.012, (6, 3))
@@ -118,7 +118,7 @@ def test_recomputed_frames_equal_the_chain_of_single_frames():
 
 
 @pytest.mark.parametrize(("frames", "again"), [(1, 4), (3, 2), (9, 0)])
-def test_a_window_gives_what_its_solver_gives_and_simulates_less(frames: int, again: int, monkeypatch: pytest.MonkeyPatch):
+def test_a_window_gives_what_its_solver_gives_and_simulates_less(frames, again, monkeypatch):
     """Five frames of which the last ones are held: the same numbers bit for bit; only what is no longer held is simulated again."""
     body, x, v, hands = random_scene(26, self_collision=True, frames=5)
     motion, simulated = torch.tensor(hands), []
@@ -144,7 +144,7 @@ def test_a_window_gives_what_its_solver_gives_and_simulates_less(frames: int, ag
     assert all(torch.equal(one, other) for one, other in zip(got, expected, strict=True))
 
 
-def test_a_window_is_as_long_as_its_memory(monkeypatch: pytest.MonkeyPatch):
+def test_a_window_is_as_long_as_its_memory(monkeypatch):
     body, x, v, hands = random_scene(27, frames=4)
     size = solver_for(body, 2).nbytes
     monkeypatch.setattr(solver_module, "FRAME_WINDOW_BYTES", 2 * size + size // 2)
@@ -155,7 +155,7 @@ def test_a_window_is_as_long_as_its_memory(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("threads", [False, True])
-def test_only_gradients_keep_all_substeps_and_frames_do_not_add_to_buffers(threads: bool):
+def test_only_gradients_keep_all_substeps_and_frames_do_not_add_to_buffers(threads):
     sizes = {}
     for substeps in (10, 40):
         body, x, v, hands = random_scene(33, substeps=substeps)
@@ -230,7 +230,7 @@ def test_a_frame_that_is_left_out_ends_the_gradient_and_earlier_frames_keep_thei
     ("kind", "place", "value", "bound"),
     [("ground", 0, -0.1, 0.0), ("ground", 1, 2.1, 2.0), ("contact", 0, 1.1, 1.0), ("contact", 1, -0.1, 0.0)],
 )
-def test_no_gradient_beyond_the_clamps(kind: str, place: int, value: float, bound: float):
+def test_no_gradient_beyond_the_clamps(kind, place, value, bound):
     """Contact scalars may drift out of their range (released quirk 5): used at the bound, gradient zero."""
     body, x, v, hands = random_scene(53, nodes=6, substeps=10, frame_time=0.02, self_collision=True)
     moved, at_bound = (

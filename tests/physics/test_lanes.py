@@ -105,14 +105,14 @@ def of(population: Results, number: int) -> Results:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(("dtype", "count"), SIZES)
-def test_a_twin_gets_what_it_gets_alone(dtype: torch.dtype, count: int, variant: str):
+def test_a_twin_gets_what_it_gets_alone(dtype, count, variant):
     got = together([member(number, variant) for number in range(count)], dtype)
     for number in range(count):
         assert_same(of(got, number), member_alone(number, variant, dtype), number)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_twins_differ_and_are_lively(variant: str):
+def test_twins_differ_and_are_lively(variant):
     """Otherwise equality would say little: each reaches its contacts, and none is another's copy."""
     members = [member(number, variant) for number in range(17)]
     simulation = members[0].body.simulation
@@ -126,7 +126,7 @@ def test_twins_differ_and_are_lively(variant: str):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_twins_have_graphs_of_their_own(variant: str):
+def test_twins_have_graphs_of_their_own(variant):
     """The solver holds the union of their springs; absent ones have neither stiffness nor dashpot, and change nothing."""
     members, rng = [member(number, variant) for number in range(6)], np.random.default_rng(1)
     present = rng.random((6, len(members[0].body.springs))) < 0.6
@@ -155,7 +155,7 @@ def assert_same_by_threads(got: Results, wanted: Results, variant: str):
 
 @pytest.mark.parametrize(("device", "threads"), WAYS[1:])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(variant: str, device: str, threads: bool):
+def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(variant, device, threads):
     members, options = [member(number, variant) for number in range(3)], {"device": device, "threads": threads}
     got = together(members, SINGLE, **options)
     for number, one in enumerate(members):
@@ -166,7 +166,7 @@ def test_a_thread_per_node_gives_what_it_gives_alone_and_what_one_thread_gives(v
 
 @pytest.mark.parametrize("broken", [0, 3])
 @pytest.mark.parametrize("how", ["nan", "infinite speed", "far away", "divergence"])
-def test_a_broken_twin_breaks_no_other(how: str, broken: int):
+def test_a_broken_twin_breaks_no_other(how, broken):
     members = [member(number, "all") for number in range(7)]
     one = members[broken]
     members[broken] = {
@@ -183,7 +183,7 @@ def test_a_broken_twin_breaks_no_other(how: str, broken: int):
 
 
 @pytest.mark.parametrize(("name", "value"), [("gravity", 1.6), ("self_collision", True), ("collision_capacity", 7)])
-def test_twins_share_their_physics(name: str, value: Any):
+def test_twins_share_their_physics(name, value):
     """What the solver takes from the first would be wrong for the others."""
     body, *_ = member(0, "ground")
     with pytest.raises(InputError, match=rf"simulation\.{name}.*same for all twins"):
@@ -195,7 +195,7 @@ def test_twins_share_their_physics(name: str, value: Any):
 
 @settings(max_examples=15, deadline=None)
 @given(st.data())
-def test_order_and_direction_of_springs_do_not_matter(data: st.DataObject):
+def test_order_and_direction_of_springs_do_not_matter(data):
     one = member(data.draw(st.integers(0, 5)), data.draw(st.sampled_from(sorted(VARIANTS))))
     count = len(one.body.springs)
     order = np.array(data.draw(st.permutations(range(count))))

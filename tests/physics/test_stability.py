@@ -31,7 +31,7 @@ def held_node(substep: float, stiffness: float, dashpot: float) -> Scene:
 
 
 @pytest.mark.parametrize(("stiffness", "dashpot"), [(80.0, 0.0), (80.0, 20.0), (1e-6, 20.0)])
-def test_the_bound_is_sharp_for_an_oscillator(stiffness: float, dashpot: float):
+def test_the_bound_is_sharp_for_an_oscillator(stiffness, dashpot):
     """Just below dt^2 lambda + 2 dt c = 4 a small extension stays small, just above it diverges."""
     largest = Spectrum(stiffness / LENGTH, dashpot, 0).largest_substep(1.0)
     start = 1e-9
@@ -65,7 +65,7 @@ def random_twin(seed: int, **simulation: object) -> Twin:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_spectrum_of_a_net(seed: int):
+def test_spectrum_of_a_net(seed):
     """Lanczos finds the eigenvalues of the dense matrices, from below."""
     twin = random_twin(seed)
     spectrum = stability.twin_spectrum(twin)
@@ -87,7 +87,7 @@ def refused(twin: Twin) -> str:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_check_names_node_bound_and_remedy(seed: int):
+def test_check_names_node_bound_and_remedy(seed):
     twin = random_twin(seed, frame_time=0.5, substeps=2)
     spectrum, message = stability.twin_spectrum(twin), refused(twin)
     assert f"node {spectrum.node}" in message
@@ -107,7 +107,7 @@ def with_substeps(twin: Twin, count: int) -> Twin:
 
 
 @pytest.mark.parametrize("safety", [1.0, 0.8, 0.3])
-def test_smallest_safe_substeps_is_smallest(safety: float):
+def test_smallest_safe_substeps_is_smallest(safety):
     spectrum, frame_time = Spectrum(3.7e5, 130.0, 0), 1 / 30
     for one in (spectrum, Spectrum(0.0, 40.0, 0), Spectrum(1e6, 0.0, 0)):
         assert one.load(one.largest_substep(safety)) == pytest.approx(STABILITY_LIMIT * safety)
@@ -118,7 +118,7 @@ def test_smallest_safe_substeps_is_smallest(safety: float):
 
 
 @pytest.mark.parametrize("load", [2.4, 3.6])
-def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float):
+def test_a_prediction_keeps_the_sign_of_a_damped_mode(load):
     """Two nodes on a dashpot: c = 2 gamma, so their relative velocity is 1 - load / 2 times itself after a substep."""
     gamma, frame_time = 300.0, 1 / 30
     substeps = int(np.ceil(frame_time * 4 * gamma / load))
@@ -137,7 +137,7 @@ def test_a_prediction_keeps_the_sign_of_a_damped_mode(load: float):
     assert stability.for_prediction(predicted) == predicted
 
 
-def test_a_spectrum_that_does_not_converge_is_above_the_value(monkeypatch: pytest.MonkeyPatch):
+def test_a_spectrum_that_does_not_converge_is_above_the_value(monkeypatch):
     twin, value = random_twin(0), stability.twin_spectrum(random_twin(0)).stiffness
     monkeypatch.setattr(lanczos, "RESTARTS", 1)
     monkeypatch.setattr(stability, "TOLERANCE", -1.0)
@@ -145,7 +145,7 @@ def test_a_spectrum_that_does_not_converge_is_above_the_value(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_spectrum_is_arpack_s(seed: int):
+def test_a_spectrum_is_arpack_s(seed):
     """Not only near it: the number of substeps of a candidate hangs on its last digits."""
     twin = random_twin(seed)
     for matrix, value in zip(matrices(twin), vars(stability.twin_spectrum(twin)).values(), strict=False):

@@ -35,7 +35,7 @@ def report(results: Path, **options) -> str:
 
 
 @pytest.fixture(scope="module")
-def full(tmp_path_factory) -> Path:
+def full(tmp_path_factory):
     """Two scenarios, two methods, two seeds, with pictures, films, jobs and judged perception."""
     results = report_tree.make(tmp_path_factory.mktemp("report") / "results")
     report_tree.write_jobs(results, ["rope", "cloth"], ["baseline", "neuspring"], [0, 1], never=7)
@@ -45,12 +45,12 @@ def full(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(full) -> str:
+def page(full):
     return report(full, names=NAMES, settings=config.Config(studies=("systems",), search=config.Search(rollouts=44)))
 
 
 @pytest.fixture
-def small(tmp_path) -> Path:
+def small(tmp_path):
     return report_tree.make(tmp_path / "results", pictures=False)
 
 

@@ -23,12 +23,12 @@ def golden(name: str) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def m01() -> dict[str, np.ndarray]:
+def m01():
     return golden("m01_images")
 
 
 @pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
-def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+def dtype(request):
     return request.param
 
 

@@ -130,7 +130,7 @@ def test_a_row_says_what_it_is():
 
 
 @pytest.mark.parametrize(("end", "tasks"), [(1, []), (2, []), (3, ["reconstruction"]), (4, ["reconstruction"])])
-def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end: int, tasks: list[str]):
+def test_a_diverged_rollout_gives_no_row_for_the_tasks_it_missed(end, tasks):
     """Five frames, three of them training: diverging in frame `end` leaves only complete tasks, and never a NaN."""
     given = observations(tracks=np.zeros((5, 1, 3)))
     broken = rollout(np.tile(given.nodes, (end, 1, 1)), frame_count=5, diverged_frame=end, reason="node 0 left the scene")

@@ -45,7 +45,7 @@ def weigh(
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> dict[str, Path]:
+def given(tmp_path):
     small.observations().save(tmp_path / "observations.npz")
     Recorder("search", tmp_path / "search.json").save()
     return {"observations": tmp_path / "observations.npz", "search": tmp_path / "search.json", "output": tmp_path / "weigh.json"}

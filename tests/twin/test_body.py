@@ -16,7 +16,7 @@ from tests.support.bodies import differing, require_answers
 
 
 @pytest.fixture(scope="module")
-def twin() -> Twin:
+def twin():
     return small.fit_problem().twin
 
 

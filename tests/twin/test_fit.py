@@ -26,7 +26,7 @@ FIELD = config.SpringFieldSettings()
 
 
 @pytest.fixture(autouse=True)
-def small_field(monkeypatch: pytest.MonkeyPatch):
+def small_field(monkeypatch):
     """Fields small enough for tests."""
     for name, value in {"FIELD_CHANNELS": 4, "FIELD_HIDDEN": 16, "FIELD_BANDS": 2}.items():
         monkeypatch.setattr(f"neuspring.twin.field.{name}", value)

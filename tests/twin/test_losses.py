@@ -24,13 +24,13 @@ CASES = range(3)
 
 
 @pytest.fixture(scope="module")
-def golden() -> dict[str, np.ndarray]:
+def golden():
     with np.load(Path(__file__).parents[1] / "golden/m05_train_losses.npz", allow_pickle=False) as stored:
         return {key: stored[key] for key in stored.files}
 
 
 @pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
-def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+def dtype(request):
     return request.param
 
 
@@ -64,7 +64,7 @@ def test_gradients_of_many_points_are_equal_in_every_call_with_two_threads():
 
 
 @pytest.mark.parametrize("k", CASES)
-def test_golden_terms(golden: dict[str, np.ndarray], k: int, dtype: torch.dtype):
+def test_golden_terms(golden, k, dtype):
     """Small errors, errors beyond 1 m, nothing visible: values and gradients of each term, and their sum."""
     c = case(golden, k, dtype)
     points, visible, valid = (torch.stack([c[name]] * 2) for name in ("gt", "visible", "motion_valid"))
@@ -155,7 +155,7 @@ def height(loss: FrameLoss, state: losses.FrameState) -> torch.Tensor:
     return (state.x[:, 2] - 0.1).square().mean()
 
 
-def test_a_new_term_is_a_weight_and_a_function(monkeypatch: pytest.MonkeyPatch):
+def test_a_new_term_is_a_weight_and_a_function(monkeypatch):
     """Search and fit follow: their costs of a rollout agree, with that of the term itself."""
     monkeypatch.setitem(losses.TERMS._own, "height", height)
     weights = Weights(chamfer=0.0, track=0.0, acceleration=0.0)

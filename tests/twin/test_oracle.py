@@ -33,7 +33,7 @@ def test_an_oracle_reads_what_comes_after_the_split():
 
 
 @pytest.fixture(scope="module")
-def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def started(tmp_path_factory):
     folder = tmp_path_factory.mktemp("oracle")
     small.observations().save(folder / "observations.npz")
     seen, output = folder / "observations.npz", folder / "search.json"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ def problems(collide: bool = False, **changes: object) -> list[SearchProblem]:
 
 
 @pytest.mark.parametrize("share", [False, True])
-def test_searches_of_several_scenes_end_as_each_alone(share: bool, monkeypatch: pytest.MonkeyPatch):
+def test_searches_of_several_scenes_end_as_each_alone(share, monkeypatch):
     """In turns, as on a CPU, or with shared launches, as on a GPU."""
     given, sizes = problems(collide=share), []
     assert len({len(one.observations.nodes) for one in given}) == 2
@@ -103,7 +102,7 @@ def several() -> list[FitProblem]:
 
 
 @pytest.mark.slow
-def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_fits_in_and_out_of_step_equal_those_alone(tmp_path, monkeypatch):
     """Whatever the others do: more substeps, another horizon, an earlier end, an error. Each continues from its checkpoint."""
     problems = several()
     alone = [fit(problem) for problem in problems]
@@ -122,7 +121,7 @@ def test_fits_in_and_out_of_step_equal_those_alone(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("factor", [1e-9, 2.0])
-def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, monkeypatch: pytest.MonkeyPatch):
+def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor, monkeypatch):
     monkeypatch.setattr(fit_module, "ADJOINT_LIMIT", factor)
     base = small.fit_problem()
     problems = [replace(base, fit=replace(base.fit, horizon=0, learning_rate=rate)) for rate in (1e-2, 5e-2)]
@@ -132,7 +131,7 @@ def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor: float, m
         assert got.facts["frames_left_out"] == wanted.facts["frames_left_out"] > 0
 
 
-def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch):
+def test_fits_in_step_share_their_launches(monkeypatch):
     """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
     frames: list[int] = []
     original = FrameSolver.forward
@@ -148,7 +147,7 @@ def test_fits_in_step_share_their_launches(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("collide", [False, True])
-def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bool):
+def test_a_frame_and_its_gradients_by_a_thread_per_node(device, collide):
     """The way of a GPU; there an atomic sum of contacts may round in another order."""
     twins = [candidate(problem, small.start_values()) for problem in problems(collide)[:2]]
     union = Union([twin.topology for twin in twins])
@@ -174,7 +173,7 @@ def test_a_frame_and_its_gradients_by_a_thread_per_node(device: str, collide: bo
 
 
 @pytest.mark.parametrize("device", [pytest.param("cuda:0", marks=CUDA)])
-def test_searches_and_fits_share_launches_on_a_gpu(device: str):
+def test_searches_and_fits_share_launches_on_a_gpu(device):
     """The first generation of each search judges what it does alone."""
     given = problems(device=device)
     together = search_many([SearchRun(one, 0) for one in given])

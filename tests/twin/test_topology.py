@@ -53,7 +53,7 @@ def test_springs_and_rest_lengths_are_those_of_the_rest_shape():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_golden_springs(name: str):
+def test_golden_springs(name):
     """The same set of springs as the released code builds from the same points, and the same rest lengths."""
     c = clip(name)
     recorded = c.twin.topology
@@ -85,7 +85,7 @@ def brute(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> set[t
 
 @settings(max_examples=60, deadline=None)
 @given(seed=seeds, count=st.integers(1, 30))
-def test_object_springs_are_the_union_of_what_nodes_ask_for(seed: int, count: int):
+def test_object_springs_are_the_union_of_what_nodes_ask_for(seed, count):
     """Also with a radius and a count of its own for every node, as piecewise topologies have."""
     rng, nodes = np.random.default_rng(seed), cloud(seed, count)
     radius, neighbors = rng.uniform(0.05, 0.8, count), rng.integers(1, 12, count)
@@ -130,7 +130,7 @@ def lattices() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("count", [2, 5, 8])
 @pytest.mark.parametrize("name", lattices())
-def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str, count: int):
+def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name, count):
     """On a lattice nearly all merges are ties: Ward's method alone agrees with itself by an adjusted Rand index of 0.3."""
     nodes = lattices()[name].astype(np.float32)
     labels, rng = graphs.regions(nodes, count), np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_regions_depend_neither_on_the_unit_nor_on_the_order_of_nodes(name: str,
 
 @settings(max_examples=20, deadline=None)
 @given(seed=seeds, repair=st.booleans())
-def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed: int, repair: bool):
+def test_node_order_permutes_labels_and_springs_and_changes_nothing_else(seed, repair):
     nodes, hands = cloud(seed), cloud(seed + 1, 2) + 0.3
     order = np.random.default_rng(seed + 2).permutation(25)
     # The last region asks for so little that some nodes are left alone, which `repair` then joins.

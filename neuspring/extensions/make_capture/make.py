@@ -14,11 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
 
 from neuspring.config import parse
 from neuspring.core.errors import InputError
 from neuspring.core.files import load_json, write_text
 from neuspring.core.findings import refuse
+from neuspring.core.geometry import lean
 from neuspring.core.records import digest_file
 from neuspring.core.text import Progress
 from neuspring.data import capture
@@ -57,6 +59,8 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             rule = "one of --color and --recording is required, or --controllers with --nodes and --tracks"
             raise InputError("make-capture", rule, "both" if intake.color else "none")
         return _of_points(intake)
+    if intake.plumb:
+        raise InputError("--plumb", "is for points in space without color", "cameras", "State the pose of the table in rig.json.")
     rig = read_rig(intake.rig)
     if intake.recording:
         opened = open_recording(intake)
@@ -207,12 +211,16 @@ def _begun(intake: Intake, made: Description, seen: Mapping[str, SeenCamera]) ->
     folder = intake.output
     space, findings = points.look(Capture(folder, made), intake.brought)
     refuse(findings)
+    if intake.plumb and space.hands is not None:
+        first = space.annotated[0, np.isfinite(space.annotated[0]).all(axis=1)]
+        turn = lean(np.concatenate([space.nodes, first]), space.hands.points[0], made.up_sign)
+        space = space.turned(Rotation.from_rotvec(turn).as_matrix())
     lenses = {name: [view.lens.model, *view.lens.distortion.tolist()] for name, view in seen.items()}
     begun = prepare(folder, TypeAdapter(Description).dump_python(made, mode="json") | {"distortion": lenses}, intake.force)
     writer = Writer(folder, made)
     yield writer, begun
     points.write(folder, space.hands, space.nodes)
-    writer.finish(writer.capture.tracks(intake.tracks) if intake.tracks else None)
+    writer.finish(space.annotated if intake.tracks else None)
     (folder / capture.RECIPE).unlink()
 
 

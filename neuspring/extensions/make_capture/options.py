@@ -56,6 +56,8 @@ class Intake:
     """points in space without color: rows per second; a C3D file states it"""
     up: Up | None = None
     """points in space without color, required: the axis that points up"""
+    plumb: bool = False
+    """points in space without color: turn all so that the object hangs straight below its hands in frame 0"""
     no_table: bool = False
     """points in space without color: no table is below the object"""
     mass: float | None = None

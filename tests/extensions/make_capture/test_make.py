@@ -6,15 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
+from neuspring.checks.observed import Observed, leaning
 from neuspring.cli.main import main
+from neuspring.config import Config
 from neuspring.core.errors import InputError
 from neuspring.core.geometry import rigid_inverse
-from neuspring.data.capture import CONTROLLERS, NODES, RECIPE, TRACKS, Capture
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, RECIPE, TRACKS, Capture
 from neuspring.extensions.make_capture import make
 from neuspring.extensions.make_capture.make import make_capture
 from neuspring.extensions.make_capture.options import Intake
 from neuspring.intake.check import check_layout
-from neuspring.intake.points import Hands, read, write
+from neuspring.intake.points import Hands, observe, read, write
+from neuspring.scenes.sources import row_of_capture
 from tests.support import spaced as scene
 from tests.support.c3d_files import write_c3d
 from tests.support.desk import FRAMES, LENS, K, camera, looking, seen, write_folders, write_json, write_rig
@@ -228,6 +231,25 @@ def test_points_without_color_become_a_capture(tmp_path):
     assert made.description.provenance["nodes file"].startswith("sha256:")
     with pytest.raises(InputError, match="Move them away"):
         make_capture(of_points(tmp_path, force=True))
+
+
+@pytest.mark.parametrize("up", ["+z", "-z"])
+def test_a_sheet_that_leans_is_named_and_turned_below_its_hands(tmp_path, up):
+    sign, angle = (1 if up == "+z" else -1), np.radians(3)
+    y, down = (each.ravel() for each in np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0.02, 0.3, 8)))
+    sheet = np.stack([down * np.sin(angle), y, sign * (1 - down * np.cos(angle))], axis=1)
+    hands = np.array([[0.0, -0.1, sign], [0.0, 0.1, sign]])
+    (tmp_path / "files").mkdir()
+    write(tmp_path / "files", Hands(np.repeat(hands[None], 8, axis=0), np.zeros((0, 0), bool), np.zeros(0, int)), sheet)
+    (tmp_path / "files" / TRACKS).write_text(json.dumps(np.repeat(sheet[:, None], 8, axis=1).tolist()))
+    files = {"controllers": CONTROLLERS[0], "nodes": NODES[0], "tracks": TRACKS}
+    brought_here = {name: tmp_path / "files" / file for name, file in files.items()}
+    for plumb, wanted in ((False, 3.0), (True, 0.0)):
+        output = tmp_path / f"{plumb}"
+        made, _ = make_capture(of_points(tmp_path, **brought_here, output=output, up=up, no_table=True, plumb=plumb))
+        seen_now = observe(row_of_capture(output / CAPTURE), output, Config(), output)
+        assert leaning(Observed(seen_now))["value"] == pytest.approx(wanted, abs=1e-3)
+        np.testing.assert_allclose(made.tracks()[0], seen_now.nodes, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def checked(folder: Path, data: Any, **settings: Any) -> list[Finding]:
 
 
 @pytest.mark.parametrize("data", [swinging(), swinging()[:, :, ::-1], swinging()[:, [1, 0, 2]] * [[-1.0], [1.0], [1.0]]])
-def test_a_right_recording_has_no_findings(tmp_path: Path, data: np.ndarray):
+def test_a_right_recording_has_no_findings(tmp_path, data):
     assert checked(tmp_path, data) == []
 
 
@@ -79,9 +79,7 @@ def y_up(data: np.ndarray) -> np.ndarray:
         (swinging(rate=30.0, samples=150), "rate of the recording", "warning", (100 / 30) ** 2, {"rate": 30.0}),
     ],
 )
-def test_unit_rate_and_up_are_held_against_the_data(
-    tmp_path: Path, data: np.ndarray, name: str, level: str, value: float, mends: dict[str, Any]
-):
+def test_unit_rate_and_up_are_held_against_the_data(tmp_path, data, name, level, value, mends):
     found = [one for one in checked(tmp_path, data) if one.name != "markers on one place"]
     (one,) = found
     assert (one.name, one.level) == (name, level)
@@ -91,7 +89,7 @@ def test_unit_rate_and_up_are_held_against_the_data(
     assert checked(tmp_path, data, **mends) == []
 
 
-def test_settings_are_applied_by_the_reader(tmp_path: Path):
+def test_settings_are_applied_by_the_reader(tmp_path):
     path, data = tmp_path / "7.pkl", swinging()
     path.write_bytes(pickle.dumps(1000 * y_up(data), protocol=4))
     seen = mocap.read(ROW, path, Mocap(unit=0.001, up="+y", rate=50.0, stride=1, start=1))
@@ -101,20 +99,20 @@ def test_settings_are_applied_by_the_reader(tmp_path: Path):
 
 
 @pytest.mark.parametrize("up", ["+x", "-x", "+y", "-y", "+z", "-z"])
-def test_a_recording_is_turned_and_never_mirrored(up: str):
+def test_a_recording_is_turned_and_never_mirrored(up):
     turned = in_space(np.eye(3)[None], Mocap(up=up))[0]
     assert np.linalg.det(turned) == 1 and turned[2, "xyz".index(up[1])] == (1 if up[0] == "+" else -1)
 
 
 @pytest.mark.parametrize("order", [[0, 1, 3, 2, *range(4, 13)], np.random.default_rng(0).permutation(13).tolist()])
-def test_columns_in_another_order_are_named(tmp_path: Path, order: list[int]):
+def test_columns_in_another_order_are_named(tmp_path, order):
     (found,) = checked(tmp_path, swinging()[:, :, order])
     assert (found.name, found.level) == ("order along the cable", "error") and found.value > 1.5
     proposed = [int(k) for k in found.text.rpartition("data[:, :, [")[2].rstrip("].").split(",")]
     assert checked(tmp_path, swinging()[:, :, order][:, :, proposed]) == []
 
 
-def test_a_branched_cable_is_refused(tmp_path: Path):
+def test_a_branched_cable_is_refused(tmp_path):
     (found,) = checked(tmp_path, branched())
     assert (found.name, found.level) == ("order along the cable", "error") and found.value > 3
     assert "branches at markers 4, 7" in found.text
@@ -126,7 +124,7 @@ def test_a_branched_cable_is_refused(tmp_path: Path):
     np.testing.assert_array_equal(np.reshape(rows, (3, 500, -1)).transpose(1, 0, 2), branched())
 
 
-def test_lost_and_exchanged_markers(tmp_path: Path):
+def test_lost_and_exchanged_markers(tmp_path):
     data = swinging()
     data[np.arange(500) % 50 < 6, :, 6] = 0.0
     (found,) = checked(tmp_path, data)
@@ -139,6 +137,6 @@ def test_lost_and_exchanged_markers(tmp_path: Path):
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 @pytest.mark.parametrize("cable", ["DLO1", "DLO2", "DLO3", "DLO4"])
-def test_released_recordings_have_no_findings(cable: str):
+def test_released_recordings_have_no_findings(cable):
     for file in sorted((REAL / cable).glob("*/*.pkl"))[::7]:
         assert [one for one in check_layout(file) if one.level != "note"] == []

@@ -27,7 +27,7 @@ def moved(rod: Rod, turns: Rotation, shifts: np.ndarray, drag: float = 0.0, **ch
 
 
 @pytest.mark.parametrize("jolt", [0.0, 0.05])
-def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt: float):
+def test_turned_and_shifted_paths_of_a_hand_move_the_rod_alike(jolt):
     rod = make.clamped(
         9, damping=0.01, curvature=np.full((9, 2), 0.1), tilts=np.array([[0.1, -0.2], [0, 0]]), clamps=np.full((2, 3), 0.01)
     )

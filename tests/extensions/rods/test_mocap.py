@@ -56,7 +56,7 @@ def write(tmp_path: Path, value: Any) -> Path:
 
 
 @pytest.mark.parametrize("as_lists", [True, False], ids=["lists, as released", "array"])
-def test_markers_and_time(tmp_path: Path, as_lists: bool):
+def test_markers_and_time(tmp_path, as_lists):
     data = recording()
     path = write(tmp_path, data.tolist() if as_lists else data)
     observations = mocap.read(ROW, path, Mocap(stride=2))
@@ -76,7 +76,7 @@ def test_markers_and_time(tmp_path: Path, as_lists: bool):
     assert "stride=2" in scenario.provenance["options"]
 
 
-def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame_0(tmp_path: Path):
+def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame_0(tmp_path):
     data = recording()
     # The ends turn too, so that points of clamps have velocities of their own.
     data[:, :, :2] += 0.01 * np.sin(np.linspace(0, 3, 40))[:, None, None] * np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.5]])
@@ -94,7 +94,7 @@ def test_the_line_runs_through_all_markers_and_its_velocity_is_that_before_frame
     assert len(mocap.read(ROW, write(tmp_path, data), Mocap()).velocity_before) == 0
 
 
-def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_path: Path):
+def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_path):
     path = write(tmp_path, recording())
     seen = mocap.read(ROW, path, Mocap(start=1, stride=1, frames=39, train_fraction=1.0))
     assert (seen.scenario.frame_count, seen.scenario.train_end) == (39, 39)
@@ -116,7 +116,7 @@ def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_pat
         (recording()[:, :, [0, 1, 2, 2, 4, 5, 6, 7]], r"markers 2 and 3"),
     ],
 )
-def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str):
+def test_bad_recordings_are_refused(tmp_path, value, message):
     path = write(tmp_path, value)
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, path, Mocap())
@@ -124,14 +124,14 @@ def test_bad_recordings_are_refused(tmp_path: Path, value: Any, message: str):
 
 
 @pytest.mark.parametrize(("settings", "message"), [(Mocap(stride=20), "stride = 20"), (Mocap(start=37), "mocap.start = 37")])
-def test_settings_that_do_not_fit_are_refused(tmp_path: Path, settings: Mocap, message: str):
+def test_settings_that_do_not_fit_are_refused(tmp_path, settings, message):
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, write(tmp_path, recording()), settings)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 @pytest.mark.parametrize(("cable", "observed"), [("DLO1", 9), ("DLO2", 8), ("DLO3", 8), ("DLO4", 8)])
-def test_released_recordings(cable: str, observed: int):
+def test_released_recordings(cable, observed):
     file = min((REAL / cable / "train").glob("*.pkl"))
     assert [d for d in check_layout(file) if d.level != "note"] == []
     observations = mocap.read(dataclasses.replace(ROW, scenario=cable), file, Mocap())
@@ -184,7 +184,7 @@ def test_points_keep_their_distance_to_the_marker_and_lie_normal_to_the_end():
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.7, np.pi / 2])
-def test_a_planar_motion_turns_the_normal_in_the_plane_by_the_same_angle(roll: float):
+def test_a_planar_motion_turns_the_normal_in_the_plane_by_the_same_angle(roll):
     angle = 1.2 * np.sin(np.linspace(0, 7, 300))
     out_of_plane = np.array([0.0, 1.0, 0.0])
     in_plane = turning(angle + np.pi / 2)
@@ -223,14 +223,14 @@ def read(folder: Path, **settings: object) -> mocap.Observations:
     return mocap.read(ROW, write(folder, cable()), Mocap(**settings))  # type: ignore[arg-type]
 
 
-def test_clamps_follow_the_markers_among_the_controllers(tmp_path: Path):
+def test_clamps_follow_the_markers_among_the_controllers(tmp_path):
     clamped = read(tmp_path)
     assert clamped.controller_points.shape == (21, 4 + 4 * 3, 3)
     offsets = clamped.controller_points[:, 4:].reshape(21, 4, 3, 3) - clamped.controller_points[:, :4, None]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=3), 0.006, atol=SINGLE)
 
 
-def test_a_clamp_turns_as_it_does_at_the_full_rate_and_does_not_know_later_frames(tmp_path: Path):
+def test_a_clamp_turns_as_it_does_at_the_full_rate_and_does_not_know_later_frames(tmp_path):
     every, second = read(tmp_path, stride=1), read(tmp_path, stride=2)
     np.testing.assert_array_equal(every.controller_points[::2], second.controller_points)
     first = read(tmp_path, stride=2, frames=9)

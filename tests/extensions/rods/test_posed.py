@@ -54,7 +54,7 @@ def recorded(twin: Twin, here: Observations) -> Observations:
     return replace(here, object_points=points, tracks=points)
 
 
-def test_a_hand_carries_its_points_and_the_unloaded_body_hangs_straight_from_it(tmp_path: Path):
+def test_a_hand_carries_its_points_and_the_unloaded_body_hangs_straight_from_it(tmp_path):
     rows = table()
     here = seen(tmp_path, rows)
     turns = Rotation.from_quat(rows[["qx", "qy", "qz", "qw"]].to_numpy())
@@ -70,7 +70,7 @@ def test_a_hand_carries_its_points_and_the_unloaded_body_hangs_straight_from_it(
     np.testing.assert_allclose(rest, UNLOADED, atol=SINGLE)
 
 
-def test_angles_stride_and_gaps_of_markers(tmp_path: Path):
+def test_angles_stride_and_gaps_of_markers(tmp_path):
     rows = table()
     angles = Rotation.from_quat(rows[["qx", "qy", "qz", "qw"]].to_numpy()).as_euler("ZYX")
     turned = rows.assign(**dict(zip(("z1", "y1", "x1"), angles.T, strict=True)))
@@ -94,12 +94,12 @@ def test_angles_stride_and_gaps_of_markers(tmp_path: Path):
         (lambda rows: rows, {"stride": 20}, r"at least 5 samples"),
     ],
 )
-def test_faults_are_named_with_the_next_move(tmp_path: Path, change, settings, message: str):
+def test_faults_are_named_with_the_next_move(tmp_path, change, settings, message):
     with pytest.raises(InputError, match=message):
         seen(tmp_path, change(table()), **settings)
 
 
-def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path: Path):
+def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path):
     here = seen(tmp_path, table())
     twin = rod_twin(here, Config(rod=ROD))
     assert twin.body is not None and twin.body.held.tolist() == [0, 1] + 7 * [-1] and twin.body.rolls.tolist() == [2, -1]
@@ -120,7 +120,7 @@ def test_a_rod_hangs_from_the_hand_in_frame_0_and_follows_its_turns(tmp_path: Pa
     np.testing.assert_allclose(path, here.object_points, atol=2e-3)
 
 
-def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path: Path):
+def test_a_fit_finds_stiffness_and_slip_of_a_rod_that_swings(tmp_path):
     first, second = (seen(tmp_path, table(61, seed), f"swing{seed}") for seed in (0, 1))
     steps = RodSteps(curvature="straight", horizons=(0,), rounds=12, every=2, markers=False, slip=1, robust=1e-3)
     start = rod_twin(first, Config(rod=ROD))

@@ -52,7 +52,7 @@ def shaken(frames: int, vertices: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("held", "damping"), [((0, 1, 5, 6), 0.0), ((0, 1, 5, 6), 0.01), ((0, 1), 0.01), ((0, 6), 0.01), ((), 0.01)]
 )
-def test_steps_converge_with_second_order(held: tuple[int, ...], damping: float):
+def test_steps_converge_with_second_order(held, damping):
     body = make.rod(make.crooked(7), held, damping=damping, **LIVELY)
     hands, v, options = shaken(2, 7), make.real([0.2, -0.1, 0.3]), {"frame_time": 0.005, "gravity": 9.8}
     coarse, middle, fine = (roll_out([body], hands, v, 0.5, substeps=n, **options)[-1, 0] for n in (10, 20, 40))
@@ -60,7 +60,7 @@ def test_steps_converge_with_second_order(held: tuple[int, ...], damping: float)
 
 
 @pytest.mark.parametrize("by_angle", [0.0, 1.0])
-def test_at_rest_the_energy_is_least(by_angle: float):
+def test_at_rest_the_energy_is_least(by_angle):
     """Derivatives of the energy that is written down here, by finite differences, balance the weight."""
     stiff = {"bending": 0.1, "twisting": 0.05, "stretching": 1e3, "damping": 0.02, "by_angle": by_angle}
     body = make.rod(make.crooked(7), (0, 1, 5, 6), **LIVELY | stiff)
@@ -155,7 +155,7 @@ def test_twist_makes_a_straight_rod_unstable():
 
 @pytest.mark.parametrize("damping", [0.0, 0.02, 0.3])
 @pytest.mark.parametrize(("twisting", "substeps"), [(0.1, 5), (1.0, 5), (1.0, 1)])
-def test_the_stiffest_cable_is_stable(damping: float, twisting: float, substeps: int):
+def test_the_stiffest_cable_is_stable(damping, twisting, substeps):
     """EI = 1 N m^2 at 5 cm, in substeps of 2 and 10 ms: its highest frequency is 1,600 rad/s. It begins far from its rest shape."""
     curvature = np.random.default_rng(1).normal(0, 0.3, (9, 2))
     options: dict[str, Any] = {"bending": 1.0, "twisting": twisting, "stretching": 2e4, "damping": damping, "roll": 0.5}
