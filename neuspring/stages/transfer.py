@@ -61,6 +61,8 @@ def transfer(
     courses, positions = [pd.DataFrame(columns=["scenario", "frame", "seconds", "metric", "value"])], {}
     updates, failure = 0, learned.record.reason if learned else ""
     twin = Twin.load(learned.file("twin")) if learned and learned.has("twin") else None
+    if learned and twin is None and not failure:
+        model = learned.record.settings["model"]
     for observations in () if failure else targets:
         if model is not None:
             file = learned.file("model") if learned else None
