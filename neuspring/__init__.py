@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         Twin,
         fit,
         load_run,
+        move,
         roll_out,
         sample_twin,
         score,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Observations", "Topology", "Trajectory", "Twin",
-    "fit", "load_run", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
+    "fit", "load_run", "move", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
 ]  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def leaning(seen: Observed) -> dict[str, Any] | None:
         own.object_points[:FIRST, own.object_visibility[:FIRST].all(axis=0)],
     )
     heights = up * own.nodes[:, 2]
-    hangs = heights.mean() < up * hands[:, 2].mean() - GRIP and heights.max() < up * hands[:, 2].max() + SETTLED
+    hangs = heights.mean() < up * hands[:, 2].mean() - GRIP
     free = not own.scenario.ground or heights.min() > GRIP
     still = points.size and np.linalg.norm(points - points[0], axis=2).max() < SETTLED
     return {"value": float(np.degrees(np.linalg.norm(lean(own.nodes, hands, up))))} if hangs and free and still else None

@@ -109,12 +109,12 @@ def test_one_step_alone_from_another_folder_into_a_path_with_spaces_and_quotes(p
 
 @pytest.mark.slow
 def test_a_failing_job_is_named_with_its_log_and_stops_no_other(project):
-    """The files of the second recording are there, which is all that a plan looks at, and damaged."""
+    """The small files of the second recording are right, which a plan reads, and the large one is damaged."""
     add_scenario(project, "gone", "phystwin")
     data = project / "data" / "gone"
     data.mkdir(parents=True)
     (data / "final_data.pkl").write_text("no pickle")
-    (data / "split.json").write_text("{}")
+    (data / "split.json").write_text('{"train": [0, 5], "test": [5, 8]}')
     changes = {
         "scenarios": [SCENE, "gone"],
         "methods": ["static"],
