@@ -9,7 +9,7 @@ from pydantic import Field
 
 from neuspring.core.section import Count, Finite, SettingsSection
 
-RestLengths = Literal["object", "recording"]
+RestLengths = Literal["recording", "twin"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +28,9 @@ class SimulationSettings(SettingsSection):
     initial_velocity: Literal["rest", "observed", "before"] = "rest"
     """Velocity in frame 0: zero (rest), from the first three frames (observed), or from the sample before it (before). rest is as
     released; before needs a source that knows that sample, and uses no later frame."""
-    rest_lengths: RestLengths = "object"
-    """Rest lengths of a twin on another recording with the same nodes: its own (object), or scaled with distances in that
-    recording's frame 0, which is a pose under load (recording)."""
+    rest_lengths: RestLengths = "recording"
+    """Rest lengths of a twin on another recording with the same nodes: scaled with distances in that recording's frame 0, though
+    frame 0 is a pose under load (recording), or as they are (twin)."""
 
 
 @dataclass(frozen=True, kw_only=True)

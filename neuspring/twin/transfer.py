@@ -1,14 +1,13 @@
 """A twin on another recording of the same object, where both have the same nodes in the same order.
 
-Springs keep their ends, stiffness and dashpots. Frame 0 is a pose under load, so springs of the object keep their rest lengths too;
-with `rest_lengths: recording` they follow the recording's frame 0. Up, ground and frame time are the recording's.
+Springs keep their ends, stiffness and dashpots. Rest lengths follow the recording's frame 0, a pose under load, or are kept
+(`simulation.rest_lengths`). Up, ground and frame time are the recording's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -31,7 +30,7 @@ def move(
     *,
     keep_frame_time: bool = False,
     safety: float = 0.8,
-    rest_lengths: RestLengths = "object",
+    rest_lengths: RestLengths = "recording",
 ) -> Twin:
     """The twin in frame 0 of another recording of its object.
 
@@ -52,10 +51,9 @@ def move(
 def on_nodes(twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
     """A lattice on the nodes and hands of another recording, node i on node i.
 
-    A spring keeps its ends, stiffness and dashpot, a node its mass. With `rest_lengths: object` springs of the object keep their
-    rest lengths, with `recording` their ratio to the distance of their ends in frame 0. Springs of controllers always keep the
-    ratio, and all do where the recording has a rest shape. Raises InputError if the nodes do not correspond, or a spring has no
-    length.
+    A spring keeps its ends, stiffness and dashpot, a node its mass; and the rest length with `rest_lengths: twin`, else its ratio to
+    the distance of the ends where they have no force: in the recorded rest shape, which always counts, or in frame 0. Raises
+    InputError if the nodes do not correspond, or a spring has no length.
     """
     if corresponds(twin.topology, observations):
         return replace(twin, topology=_same_nodes(twin.topology, observations, rest_lengths))
@@ -84,6 +82,8 @@ def corresponds(topology: Topology, observations: Observations) -> bool:
 def _same_nodes(topology: Topology, observations: Observations, rest_lengths: RestLengths) -> Topology:
     """The topology with the nodes of a recording, node i on node i."""
     nodes, hands = observations.nodes, observations.controller_points[0]
+    if rest_lengths == "twin" and not len(observations.rest_shape):
+        return replace(topology, nodes=nodes, controllers=hands, rest_shape=topology.canonical)
     rest, springs = topology.controller_rest, topology.springs
     now = unloaded(nodes, hands, springs, observations.rest_shape, rest)
     ratio = now / unloaded(topology.nodes, topology.controllers, springs, topology.rest_shape, rest)
@@ -95,12 +95,7 @@ def _same_nodes(topology: Topology, observations: Observations, rest_lengths: Re
         pair = topology.springs[int(np.argmin(lengths))].tolist()
         rule = "the ends of a spring may not coincide in the rest shape"
         raise InputError(f"transfer to {observations.scenario.name}", rule, f"spring {pair}")
-    changed: dict[str, Any] = {"rest_shape": observations.rest_shape}
-    if rest_lengths == "object" and not len(observations.rest_shape):
-        own = topology.object_spring_count
-        lengths[:own] = topology.rest_lengths[:own]
-        changed = {"rest_shape": topology.canonical, "controller_rest": "first_frame"}
-    return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, **changed)
+    return replace(topology, nodes=nodes, controllers=hands, rest_lengths=lengths, rest_shape=observations.rest_shape)
 
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:

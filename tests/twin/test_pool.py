@@ -20,7 +20,6 @@ SINGLE_POSITIONS = 3e-6
 """Relative: lengths of 0.02 m between positions at 0.2 m in float32, whose rounding is 1.2e-8 m, at both ends of both lengths."""
 PLACES = ("object_points", "surface_points", "controller_points")
 LIFTED, SHAKEN = "rope/lift/smooth", "rope/shake/smooth"
-BY_RECORDING = config.SimulationSettings(rest_lengths="recording")
 
 
 def seen(path: str) -> Observations:
@@ -60,7 +59,7 @@ def test_costs_are_means_over_the_recordings():
 def test_springs_and_radii_are_the_same_on_all_recordings():
     """Lengths in spacings of the scenario's own body, whatever the poses of the others."""
     search_settings = replace(short(seen(LIFTED)).search, lengths="spacing")
-    alone = replace(short(seen(LIFTED)), search=search_settings, simulation=BY_RECORDING)
+    alone = replace(short(seen(LIFTED)), search=search_settings)
     stretched = replace(seen(SHAKEN), **{name: 1.1 * getattr(seen(SHAKEN), name) for name in PLACES})
     _, (here, there) = made(replace(alone, pool=(stretched,)), alone.encode())
     np.testing.assert_array_equal(here.topology.springs, there.topology.springs)
@@ -113,7 +112,7 @@ def require_equal_twins(one: Twin, other: Twin):
 def test_recordings_share_one_material_and_one_unit():
     problem = problem_of(LIFTED, epochs=1)
     larger = replace(seen(SHAKEN), **{name: 2 * getattr(seen(SHAKEN), name) for name in PLACES})
-    run = TwinFit(replace(problem, pool=[larger], simulation=BY_RECORDING))
+    run = TwinFit(replace(problem, pool=[larger]))
     with torch.no_grad():
         run.parameters.offsets.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(0))
     here, there = (run.parameters.physical(one.start) for one in run.recordings)
