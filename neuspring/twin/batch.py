@@ -209,7 +209,8 @@ class Enter(torch.autograd.Function):
     def backward(ctx: Any, *adjoints: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
         """The adjoints, or none."""
         gate = ctx.gate
-        if gate.limit is not None and not gate.limit.passes(gate.after, adjoints[:2]):
+        # In a backward pass of others, whose window is shorter, nothing has come to the end of this fit's frame.
+        if gate.limit is not None and not (gate.after and gate.limit.passes(gate.after, adjoints[:2])):
             return (None,) * (1 + len(adjoints))
         return None, *adjoints
 

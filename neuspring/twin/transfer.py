@@ -51,9 +51,9 @@ def move(
 def on_nodes(twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
     """A lattice on the nodes and hands of another recording, node i on node i.
 
-    A spring keeps its ends, stiffness and dashpot, a node its mass. With `rest_lengths: twin` a spring keeps its rest length too, else
-    its ratio to the distance of the ends where they have no force: in the recorded rest shape, which always counts, or in frame 0.
-    Raises InputError if the nodes do not correspond, or a spring has no length.
+    A spring keeps its ends, stiffness and dashpot, a node its mass. With `rest_lengths: twin` a spring keeps its rest length too,
+    else its ratio to the distance of the ends where they have no force: in the recorded rest shape, which always counts, or in
+    frame 0. Raises InputError if the nodes do not correspond, or a spring has no length.
     """
     if corresponds(twin.topology, observations):
         return replace(twin, topology=_same_nodes(twin.topology, observations, rest_lengths))

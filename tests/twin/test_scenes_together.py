@@ -98,6 +98,8 @@ def several() -> list[FitProblem]:
         replace(coarse, kind="field", seed=3, fit=replace(base.fit, learning_rate=5e-3)),
         replace(base, fit=replace(base.fit, horizon=3, epochs=4)),
         replace(coarse, fit=replace(base.fit, horizon=0, selection="tail", epochs=2)),
+        # Windows of three frames and of one, beside one of four that begins with them.
+        replace(coarse, fit=replace(base.fit, horizon=0, epochs=2)),
     ]
 
 
