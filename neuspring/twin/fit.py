@@ -55,9 +55,9 @@ TAIL_FRACTION = 0.2
 """Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
 ROLLOUT_EVERY = 5
 """Epochs between two rollouts. All fits that share launches make theirs together."""
-PLATEAU_EPOCHS = 20
+PLATEAU_EPOCHS = 40
 """Epochs in which the lowest loss of rollouts must fall by `fit.plateau`, else the fit has converged."""
-MOST_GROWTH = 4
+MOST_GROWTH = 8
 """Substeps at most, as a multiple of the search's: a few springs that stiffen without end would set the cost of all."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
