@@ -1,5 +1,7 @@
 """The pure parts of studies: silhouettes of rivals, their shifts, IoU without hands, and what is studied."""
 
+import importlib
+
 import numpy as np
 import pytest
 
@@ -19,6 +21,14 @@ from results.published.film22.make import (
     shifted,
     silhouette,
 )
+
+
+SCRIPTS = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "results").rglob("*.py")) if path.stem != "__main__"]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=str)
+def test_every_script_finds_what_it_imports(script):
+    importlib.import_module(".".join(script.parts))
 
 
 def block(rows, columns, shape=(40, 60)):

@@ -12,8 +12,9 @@ import torch
 
 from neuspring.core.device import resolve_device
 from neuspring.extensions.spring_gaus.model import SpringGausModel, SpringGausTraining
-from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorPhysics, AnchorSolver, reference_substep
+from neuspring.extensions.spring_gaus.physics import AnchorGraph, AnchorPhysics, AnchorSolver
 from results.published.bench.simulators import take_turns
+from tests.extensions.spring_gaus.test_spring_gaus import reference_substep
 
 ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 

@@ -66,7 +66,7 @@ def scores(results: Path, methods: Sequence[str]) -> pd.DataFrame:
         for saw in every:
             folder = results / f"{case}_{saw}"
             seeds = sorted({int(path.name) for path in folder.glob("*/*") if path.name.isdecimal()})
-            table = collect(results, [folder.name], methods, seeds).scores
+            table = collect(results, [folder.name], methods, seeds).finished
             for run in table[table["metric"].isin(list(METRICS))].itertuples():
                 value = (MM if run.unit == "m" else 1.0) * run.value
                 rows.append(dict(zip(COLUMNS, (case, saw, run.method, run.seed, run.task, run.metric, value), strict=True)))

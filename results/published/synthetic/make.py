@@ -1,4 +1,4 @@
-"""First, middle and last frame of every capture in a results folder, and what each took: time, disk, numerics.
+"""First, middle and last frame of every capture in a results folder, and what each took: disk, numerics.
 
 python -m results.published.synthetic.make results/synthetic results/published/synthetic
 """
@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from neuspring.core.job_records import FOLDER, JobRecord
 from neuspring.data.capture import CAPTURE, Capture
 from neuspring.extensions.synthetic.truth import Truth, truth_path
 
@@ -32,11 +31,10 @@ def strip(capture: Capture) -> np.ndarray:
     return np.vstack([head, np.hstack(images)])
 
 
-def facts(capture: Capture, results: Path) -> dict[str, object]:
-    """The cost of a capture, from its files and the record of its job."""
+def facts(capture: Capture) -> dict[str, object]:
+    """The cost of a capture, from its files."""
     folder = capture.folder.parent
     truth = Truth.load(truth_path(capture.folder))
-    record = JobRecord.load(results / FOLDER / "capture" / f"{folder.name}.json")
     size = sum(path.stat().st_size for path in capture.folder.rglob("*") if path.is_file())
     return {
         "scenario": folder.name,
@@ -47,7 +45,6 @@ def facts(capture: Capture, results: Path) -> dict[str, object]:
         "certificate_mm": round(1e3 * truth.certificate, 4),
         "sensitivity_mm": round(1e3 * truth.sensitivity, 4),
         "least_jacobian": round(float(truth.least_jacobian.min()), 3),
-        "seconds": round(record.last.seconds, 1),
         "megabytes": round(size / 1e6, 1),
     }
 
@@ -60,7 +57,7 @@ def main(results: Path, output: Path) -> None:
     rows = [np.hstack((strips[k : k + COLUMNS] + [blank] * COLUMNS)[:COLUMNS]) for k in range(0, len(strips), COLUMNS)]
     output.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(output / "contact_sheet.jpg"), np.vstack(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    table = pd.DataFrame([facts(capture, results) for capture in captures])
+    table = pd.DataFrame([facts(capture) for capture in captures])
     table.to_csv(output / "captures.csv", index=False)
     print(table.to_string(index=False))
     print(f"{len(table)} captures, {table['seconds'].sum() / 60:.0f} minutes, {table['megabytes'].sum():.0f} MB")
