@@ -22,7 +22,6 @@ from results.published.film22.make import (
     silhouette,
 )
 
-
 SCRIPTS = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "results").rglob("*.py")) if path.stem != "__main__"]
 
 
