@@ -462,7 +462,9 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         raise NumericalFailure(f"no epoch could be completed: {'; '.join(state.rollbacks)}")
     run.parameters.restore(state.best_values)
     run.use_substeps(state.best_substeps)
-    rollout_loss = yield from run.rollout_loss()
+    loss = state.best_loss
+    if problem.fit.selection == "training_loss":
+        loss = yield from _rollout_or_infinite(run)
     best = run.parameters.as_twin(run.twin)
     history, figures = pd.DataFrame(loop.history), movement(run.parameters)
     if state.gradient_over_epsilon is not None:
@@ -470,9 +472,10 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     frames, counts = problem.frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
-        "search_loss": state.search_loss,
+        # A record has no infinite numbers.
+        "search_loss": state.search_loss if math.isfinite(state.search_loss) else None,
         "running_loss": loop.history[state.best_epoch]["loss"] if state.best_epoch >= 0 else None,
-        "rollout_loss": rollout_loss,
+        "rollout_loss": loss if math.isfinite(loss) else None,
         "converged": converged(loop.history, state.search_loss, problem.fit.plateau),
         "epochs": len(history),
         "epochs_asked": problem.fit.epochs,
@@ -496,12 +499,17 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
 def _start(run: TwinFit, problem: FitProblem) -> Generator[Any, Any, _State]:
     """The state before the first epoch."""
     values, substeps = run.parameters.copy(), problem.twin.simulation.substeps
-    loss = math.inf
     # A start that cannot be simulated does not win; if no epoch can be completed either, `fit` says so.
-    with contextlib.suppress(NonFinite):
-        loss = yield from run.rollout_loss()
+    loss = yield from _rollout_or_infinite(run)
     best = math.inf if problem.fit.selection == "training_loss" else loss
     return _State(values, {}, 1.0, [], loss, -1, best, values, substeps, substeps)
+
+
+def _rollout_or_infinite(run: TwinFit) -> Generator[Any, Any, float]:
+    """The loss of a rollout, m^2; infinite where it is not finite."""
+    with contextlib.suppress(NonFinite):
+        return (yield from run.rollout_loss())
+    return math.inf
 
 
 def converged(history: Sequence[Mapping[str, Any]], start: float, plateau: float) -> bool:

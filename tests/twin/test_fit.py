@@ -281,6 +281,16 @@ def test_no_fit_ends_behind_its_search_and_its_loss_is_that_of_its_rollout(kind,
     assert released.facts["best_epoch"] == released.history["loss"].argmin()
 
 
+def test_a_rollout_that_cannot_be_made_loses_no_fit(monkeypatch):
+    def broken(self):
+        raise module.NonFinite("broken")
+        yield
+
+    monkeypatch.setattr(TwinFit, "rollout_loss", broken)
+    facts = fit(small.fit_problem(fit=config.Fit(epochs=2, learning_rate=1e-2, selection="training_loss"))).facts
+    assert (facts["search_loss"], facts["rollout_loss"], facts["best_epoch"] >= 0) == (None, None, True)
+
+
 def test_a_fit_ends_when_rollouts_have_stopped_falling(monkeypatch):
     monkeypatch.setattr(module, "ROLLOUT_EVERY", 2)
     monkeypatch.setattr(module, "PLATEAU_EPOCHS", 4)
