@@ -24,14 +24,6 @@ def findings_of(lifted: LiftedTracks, prior: ShapePrior, up: float, image: Image
     return found + examine("hands in the image", "hands", image)
 
 
-def given_pose(lifted: LiftedTracks) -> dict[str, Any] | None:
-    """Share of a body that rises from what touches the table, where the capture says how it lies or stands."""
-    backend = lifted.backend
-    if not backend.startswith("color alone, body") or backend == "color alone, body":
-        return None
-    return {"value": lifted.facts["shape_raised"], "pose": backend.rsplit(", ", 1)[1]}
-
-
 def supposed_pose(lifted: LiftedTracks) -> dict[str, Any] | None:
     """Share of a body that is supposed to rise, where color alone shows it and nothing says whether it lies or stands."""
     if lifted.backend != "color alone, body":
@@ -52,9 +44,6 @@ def hand_sizes(image: ImageObservations) -> dict[str, Any] | None:
 
 # fmt: off
 checks = (
-    Check("pose", "pose", given_pose, None, "note",
-          "{pose}, as capture.json says; {value:.0%} of it rises from what touches the table; thickness follows the width of the "
-          "outline."),
     Check("pose", "pose", supposed_pose, None, "note",
           "if it lies, it reaches {deep:.0f} cm behind its nearest point and is {across:.0f} cm wide{rises}; one picture cannot "
           "say whether it lies or stands.", 'Write "pose": "lying" or "standing" in capture.json.'),

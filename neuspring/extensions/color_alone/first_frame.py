@@ -19,7 +19,8 @@ so. Therefore no center is farther from the camera than the upright plane
 
 a is the distance along the table in the direction in which the camera looks, s that across, on the plane through the nearest
 center. What would be beyond the plane rises in it, above what touches the table. `pose` of the capture says lying (no such plane)
-or standing (STANDING_FOOTPRINT): one picture cannot say which.
+or standing (STANDING_FOOTPRINT): one picture cannot say which. What hangs in the air (`ground: false`) lies in the upright plane
+through its nearest point on the table, sheets too: nothing says how far it is.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from neuspring.data.capture import CAPTURE, HANDS, OBJECT, Capture
 from neuspring.extensions.color_alone.pixels import disc, pixels_of
 from neuspring.perception.shape import discs
 
-SILHOUETTES = {"cloth": "flat", "rope": "round"}
-"""Shape of an object by its category: flat lies on the table, round is as thick as it is wide; all others are bodies."""
+SILHOUETTES = {"cloth": "flat", "package": "flat", "rope": "round"}
+"""Shape of an object by its category: flat is a sheet, round is as thick as it is wide; all others are bodies."""
 BENEATH = 0.03
 """Part of the object that a hand hides in frame 0: its pixels between pixels of the object, up to this far from them, m."""
 SHEET_THICKNESS = 0.004
@@ -89,19 +90,24 @@ class FirstFrame:
         size = float(np.median(below)) / camera.intrinsics[0, 0]
         filled = beneath_hands(labels, BENEATH / size)
         up = capture.description.up_sign
+        hangs, pixels, facts = not capture.description.ground, pixels_of(filled).astype(float), dict[str, float]()
+        heights, lower = np.zeros(filled.shape), np.zeros(filled.shape)
+        if kind == "flat" and not hangs:
+            heights[filled] = SHEET_THICKNESS
+            return cls(camera, up, kind, filled, heights, lower, size, facts)
         if kind == "flat":
-            heights = np.where(filled, SHEET_THICKNESS, 0.0)
-            return cls(camera, up, kind, filled, heights, np.zeros_like(heights), size, {})
-        if kind == "round":
-            # Where the silhouette is wider than a rope it shows two turns, or a shadow.
-            depth, thick, facts = medial(camera, up, filled, 1.0, np.inf, ROPE_WIDEST)
+            middle = upright_depth(camera, pixels)
+            found = [middle - SHEET_THICKNESS / 2, middle + SHEET_THICKNESS / 2]
         else:
             bounds = {None: FOOTPRINT, "lying": np.inf, "standing": STANDING_FOOTPRINT}
-            depth, thick, facts = medial(camera, up, filled, BODY_THICKNESS, bounds[capture.description.pose])
-        pixels, heights, lower = pixels_of(filled).astype(float), np.zeros(filled.shape), np.zeros(filled.shape)
-        for side, found in zip((heights, lower), inflated(filled, depth, thick), strict=True):
+            footprint = 0.0 if hangs else np.inf if kind == "round" else bounds[capture.description.pose]
+            # Where the silhouette is wider than a rope it shows two turns, or a shadow.
+            shape = (1.0, footprint, ROPE_WIDEST) if kind == "round" else (BODY_THICKNESS, footprint)
+            depth, thick, facts = medial(camera, up, filled, *shape)
+            found = [side[filled] for side in inflated(filled, depth, thick)]
+        for side, depth in zip((heights, lower), found, strict=True):
             # The table cuts off what would be below it.
-            side[filled] = np.maximum(up * camera.lift(pixels, found[filled])[:, 2], 0.0)
+            side[filled] = np.maximum(up * camera.lift(pixels, depth)[:, 2], 0.0)
         return cls(camera, up, kind, filled, heights, lower, size, facts)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
@@ -174,6 +180,18 @@ def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> n
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (z - camera.camera_to_world[2, 3]) / rays[:, 2]
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
+
+
+def upright_depth(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Depth [n], m, of pixels (x, y) [n, 2] in the upright plane that faces the camera, through the nearest of them on the table.
+
+    On the table where the camera looks down.
+    """
+    below, axis = camera_depth(camera, pixels, 0.0), camera.camera_to_world[:2, 2]
+    along = (camera.lift(pixels, np.ones(len(pixels))) - camera.camera_to_world[:3, 3])[:, :2] @ axis
+    if np.hypot(*axis) <= LEVEL_VIEW or along.min() <= 0:
+        return below
+    return np.asarray((below * along).min() / along)
 
 
 def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:

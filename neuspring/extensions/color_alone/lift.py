@@ -25,8 +25,6 @@ from neuspring.perception.backends import Lifted
 from neuspring.perception.controllers import ALWAYS, MOST_CONTROLLERS
 from neuspring.perception.shape import no_prior, shape_prior
 
-HAND_BAND = 30.0
-"""Distance from the object within which points beside it were drawn, pixels."""
 GRIP_REACH = 0.02
 """Distance from the object up to which pixels of a hand hold it in frame 0, m at the object."""
 GRIP_LENGTH = 0.04
@@ -139,7 +137,7 @@ def lift_color(
         marked=np.where(new[:, None, None], capture.points(name), np.nan),
     )
     if space.hands is None:
-        hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]))
+        hands = place(image, np.concatenate([first.fingers(grip) for grip in chosen]), ground=capture.description.ground)
     else:
         hands = held(space.hands, space.tracks, capture.train_end)
     colors = capture.color(name, 0) / 255.0
@@ -171,7 +169,7 @@ def lift_color(
 def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, where: str) -> SeenHands:
     """Evidence of the hands in the masks. Raises InputError for none."""
     # A hand above a sheet hides more of it than its fingers hold.
-    sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" else np.inf)
+    sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" and capture.description.ground else np.inf)
     if not (found := grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))):
         remedy = f"Mark the hands in frame 0, or bring them in space ({CONTROLLERS[0]})."
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", remedy)
@@ -210,7 +208,4 @@ def silhouettes(labels: np.ndarray, samples: int = OUTLINE_POINTS) -> dict[str, 
         shown = pixels_of(label == OBJECT)
         rows = rng.choice(len(shown), min(count, len(shown)), replace=False)
         inside[frame, : len(rows)] = shown[rows]
-        # As many points were once drawn beside the object too; without that draw the samples of later frames would be others.
-        near = int(((label == NOTHING) & (away_from(label == OBJECT) <= HAND_BAND)).sum())
-        rng.choice(near, min(count, near), replace=False)
     return {"inside": inside, "outside": outside}

@@ -302,7 +302,7 @@ def main() -> None:
     if a.cores:
         write_captures(films, captures, cases_of(films))
         command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--quiet", "rules"]
-        command += ["--until", "score", "--cores", str(a.cores), "--configfile", str(CONFIG)]
+        command += ["--until", "run", "--cores", str(a.cores), "--configfile", str(CONFIG)]
         values = {"data_root": captures.resolve(), "results": results.resolve()} | ({"only": a.only} if a.only else {})
         subprocess.run([*command, "--config", *(f"{key}={value}" for key, value in values.items())], cwd=ROOT, check=True)
     methods, kept, notes, rows = read_yaml(CONFIG)["methods"], dict[str, np.ndarray](), list[str](), list[tuple[object, ...]]()

@@ -8,8 +8,7 @@ from neuspring.checks import examine
 
 
 @pytest.mark.parametrize(
-    ("backend", "raised", "levels"),
-    [("body", 0.4, ["warning"]), ("body", 0.0, ["note"]), ("body, standing", 0.4, ["note"]), ("round", 0.0, [])],
+    ("backend", "raised", "levels"), [("body", 0.4, ["warning"]), ("body", 0.0, ["note"]), ("body, standing", 0.4, [])]
 )
 def test_how_a_body_lies_or_stands_is_said(backend, raised, levels):
     facts = {"shape_longest": 0.55, "shape_across": 0.3, "shape_raised": raised}

@@ -23,9 +23,9 @@ PIXEL = 0.005
 """m: the width of a pixel at 0.8 m."""
 
 
-def capture_of(category, up="+z", pose=None, view=None):
+def capture_of(category, up="+z", pose=None, view=None, ground=True):
     view = view or camera(np.zeros(3))
-    described = SimpleNamespace(up_sign=up_sign(up), category=category, pose=pose)
+    described = SimpleNamespace(up_sign=up_sign(up), category=category, pose=pose, ground=ground)
     return SimpleNamespace(folder=Path("painted"), cameras={"0": view}, description=described, frame_count=1, train_end=1)
 
 
@@ -53,6 +53,14 @@ def test_a_sheet_has_its_size_on_the_table():
     np.testing.assert_allclose(points[:, :2].max(axis=0), 0.1, atol=1.6 * PIXEL)
     np.testing.assert_allclose(points[:, :2].min(axis=0), -0.1, atol=1.6 * PIXEL)
     assert first.pixel_size == pytest.approx(0.8 / 180, rel=0.02)
+
+
+def test_a_sheet_that_hangs_is_upright():
+    """The camera looks along y; what is seen of the sheet is 25 cm deep on the table, and 15 to 20 cm high."""
+    points = object_points(FirstFrame.of(capture_of("package", ground=False), shown(SQUARE)))
+    assert np.ptp(points[:, 1]) < 2 * SHEET_THICKNESS
+    assert 0.1 < np.ptp(points[:, 2]) < 0.2
+    assert points[:, 2].min() == pytest.approx(0, abs=PIXEL)
 
 
 def test_a_rope_is_as_thick_as_it_is_wide():

@@ -84,6 +84,14 @@ def test_a_hand_that_disappears_goes_on_for_a_moment_and_is_counted():
     assert np.abs(motion.centers[-1] - motion.centers[7]).max() < 10
 
 
+def test_a_hand_that_is_seen_again_is_where_frame_0_says():
+    film = Film()
+    labels = np.stack(film.labels)
+    labels[4:8] = 0
+    motion = follow_hands(film, "0", labels, [np.array([[120, 125]])], radius=60)
+    np.testing.assert_allclose(motion.centers[8:, 0], [place for place, _, _ in film.true[8:]], atol=1.5)
+
+
 def test_two_hands_are_told_apart_and_specks_are_none():
     labels = np.zeros((SIZE, SIZE), np.uint8)
     labels[100:160, 40:200] = OBJECT
@@ -165,12 +173,13 @@ def way(direction):
     return np.array([0.05, 0.1, 0.02]) + 0.2 * share * direction + 0.02 * np.sin(3 * share) * [1.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 1), (0, -1, 0)])
-def test_hands_move_upright_and_do_not_go_below_their_grip(direction):
-    """The camera looks along y. A hand that rises is where it is, and so is one that is pulled towards the camera on the table."""
+@pytest.mark.parametrize(("direction", "ground"), [((0, 0, 1), True), ((0, -1, 0), True), ((0, 0, -1), False)])
+def test_hands_move_upright_and_above_a_table_not_below_their_grip(direction, ground):
+    """The camera looks along y. A hand that rises is where it is, and so is one that is pulled towards the camera on the table, or
+    goes down where there is no table."""
     path = way(direction)
     grip = path[0] + 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    placed = place(seen_on(path), grip)
+    placed = place(seen_on(path), grip, ground=ground)
     np.testing.assert_allclose(placed[0], grip, atol=1e-12)
     np.testing.assert_allclose(placed.mean(axis=1), path, atol=PIXEL32)
 
