@@ -31,14 +31,20 @@ NORM = 1e-3
 """Relative, of the norm of that gradient (the README's central differences agree to this)."""
 CONTACT_GRADIENT = 0.01
 """Relative, where not tiny."""
+STICKS = {("rope_lift", 3): 0.025}
+"""The same where rounding decides. In substep 391 of this frame node 196 sticks to the ground or slides, and friction has a
+derivative only where it slides. Of 25 starts within a rounding of the record 6 are 1.7 to 2.0 % off in float32, the others at most
+0.45 %; of the 15 that were followed, those in which this node flips are off, and no others. In float64 all are 0.53 % off."""
 TINY = 1e-6
 """m^2 per unit of elasticity or friction; the clips' largest contact gradients are 4e-5 to 5e-4."""
 CLOTH_MEDIAN, CLOTH_NODE, CLOTH_QUIET = 1e-5, 1e-5, 3e-7
 """Self-collision flips at thresholds: per frame from recorded states, median and node error [m], and the error of the frame
 where nothing flips."""
 CLOTH_FRACTION = {torch.float32: 0.35, torch.float64: 0.4}
-"""Largest share of nodes beyond CLOTH_NODE in a frame, "about a third" in float32 (measured 0.32). Other roundings flip other
-contacts, so the share in float64 is another draw (measured 0.36)."""
+"""Largest share of nodes beyond CLOTH_NODE in a frame: one draw of a chaotic clip, in which contacts at the threshold flip with
+rounding. From the record it is 0.32 in float32 and 0.36 in float64. From 12 starts within a rounding of the record it is 0.40 to
+1.0 in float32 and 0.07 to 0.61 in float64, and contacts flip in frame 6 from 4 of 6. So limits of the cloth hold the order of
+operations, and are no accuracy."""
 QUIET_FRAME = 6
 DRAWN = [name for name in NAMES if name != "cloth_selfcollision"]
 DTYPES = [torch.float32, torch.float64]
@@ -184,7 +190,9 @@ def check_frames(c: Clip, frames: dict[int, Frame]):
         norms = np.linalg.norm(got.grad_log_stiffness), np.linalg.norm(gradient)
         assert norms[0] == pytest.approx(norms[1], rel=NORM), k
         loud = np.abs(collide) > TINY
-        np.testing.assert_allclose(got.grad_collide[loud], collide[loud], rtol=CONTACT_GRADIENT, err_msg=f"contact, frame {k}")
+        np.testing.assert_allclose(
+            got.grad_collide[loud], collide[loud], rtol=STICKS.get((c.name, k), CONTACT_GRADIENT), err_msg=f"contact, frame {k}"
+        )
         assert np.abs(got.grad_collide[~loud]).max(initial=0) < 2 * TINY
 
 

@@ -76,15 +76,21 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
         """The constants of a rod; see `fit.search_rod`. It has no regions and no chance, and begins anew."""
         from neuspring.extensions.rods.fit import search_rod
 
-        device, threads = options.device, options.threads
-        return search_rod(observations, pool, settings, device=device, threads=threads, record=options.record)
+        return search_rod(observations, pool, settings, device=options.device, threads=options.threads, record=options.record)
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> RodResult:
         """All that is unknown of a rod; see `fit.fit_rod`. It begins anew."""
         from neuspring.extensions.rods.fit import fit_rod
 
-        settings, read = problem.fit.section(RodFit), (problem.observations, problem.pool, problem.twin)
-        return fit_rod(*read, settings, oracle=problem.oracle, device=problem.device, threads=threads)
+        return fit_rod(
+            problem.observations,
+            problem.pool,
+            problem.twin,
+            problem.fit.section(RodFit),
+            oracle=problem.oracle,
+            device=problem.device,
+            threads=threads,
+        )
 
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
         """Recordings of one center line; see `fit.require_pool`. Nodes around the line are free."""

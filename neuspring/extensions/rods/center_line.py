@@ -47,12 +47,13 @@ def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> n
         weights = 1 / (1 + (apart / (0.67 * BESIDE_LINE * typical)) ** 8)
         length = float(pieces(line).sum())
         slenderness = min(length / max(float(np.quantile(apart, 0.9)), 1e-9), 1e3)
-    beside = float((apart > BESIDE_LINE * typical + 1e-3 * length).mean())
+    limit = BESIDE_LINE * typical + 1e-3 * length
+    beside = float((apart > limit).mean())
     if slenderness < LEAST_SLENDERNESS or beside > MOST_BESIDE:
         rule = f"a rod is long and thin: its nodes lie around one line without branches, at least {LEAST_SLENDERNESS:g} radii long"
         found = f"{slenderness:.1f} radii" if slenderness < LEAST_SLENDERNESS else f"{beside:.0%} of the nodes far beside the line"
         raise InputError(f"{where}, nodes of frame 0", rule, found, "Choose a method whose twin is a lattice.")
-    return _equally_spaced(line, arc[apart < BESIDE_LINE * typical + 1e-3 * length], count)
+    return _equally_spaced(line, arc[apart < limit], count)
 
 
 def _from_an_end(points: np.ndarray) -> np.ndarray:
@@ -103,9 +104,9 @@ def _projected(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.nda
     before, after = (line[[k]] + np.arange(1, reach + 1)[:, None] * (end - line[k]) for k, end in ((0, ends[0]), (-1, ends[1])))
     longer = np.concatenate([before[::-1], line, after])
     edge, place = bind(longer, np.zeros((len(longer) - 1, 3)), points)
-    lengths = pieces(longer)
-    arc = arc_of(lengths)[edge] + np.clip(place[:, 0], 0, 1) * lengths[edge]
-    foot = longer[edge] + np.clip(place[:, :1], 0, 1) * np.diff(longer, axis=0)[edge]
+    lengths, part = pieces(longer), np.clip(place[:, 0], 0, 1)
+    arc = arc_of(lengths)[edge] + part * lengths[edge]
+    foot = longer[edge] + part[:, None] * np.diff(longer, axis=0)[edge]
     return arc - lengths[:reach].sum(), np.linalg.norm(points - foot, axis=1)
 
 

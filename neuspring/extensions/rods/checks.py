@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from neuspring.config import Config
 from neuspring.core.checks import Check
 from neuspring.core.errors import InputError
 from neuspring.core.findings import Finding, refusal, refused
-from neuspring.core.text import listed
+from neuspring.core.text import listed, spans
 from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.rods.rod import pieces
 from neuspring.extensions.rods.settings import Mocap
@@ -70,7 +71,7 @@ def look(file: Path, raw: Any, settings: Mocap) -> list[Finding]:
     cable = Cable(Moving(in_space(raw, settings).transpose(0, 2, 1), settings.rate), settings)
     found += examine("cable in space", file, cable)
     found += [] if refused(found) else examine("moving", file, cable.moving, CABLE_UNSEEN)
-    return found if refused(found) else found + examine("cable under gravity", file, cable)
+    return found if refused(found) else found + examine("cable in motion", file, cable)
 
 
 def check_recording(file: Path, config: Config) -> list[Finding]:
@@ -96,11 +97,6 @@ class Cable:
         self.points = moving.points[: min((frame for frame, *_ in moving.swapped), default=None)]
         self.apart = apart(self.points, np.nanmax)
         self.along = np.append(0.0, np.cumsum(np.diag(apart(self.points, np.nanmedian), 1)))
-
-    def sag(self) -> np.ndarray:
-        """Mean place [3], m, of the inner markers from that on the line of the ends at their part of the length."""
-        first, last, part = self.points[:, :1], self.points[:, -1:], (self.along / self.along[-1])[:, None]
-        return np.asarray((self.points - (1 - part) * first - part * last)[:, 2:-2].mean(axis=(0, 1)))
 
     def turned(self, span: int) -> tuple[float, float]:
         """The ratio of what turns the inner markers about the line of the ends, by their accelerations over `span` frames before
@@ -173,9 +169,23 @@ def disordered(cable: Cable) -> dict[str, Any]:
     return told | {"next": f"along the cable they are in the order {order}: write data[:, :, {order}]"}
 
 
+def ends(cable: Cable) -> Iterator[dict[str, Any]]:
+    """Frames in which the first or last three markers are not in their order: their outer two are not the farthest apart.
+
+    A gripper holds a cable straight there. In DEFORM's other recordings these are at least 1.05 times as far apart as neighbors.
+    """
+    for end, three in {"first": cable.points[:, :3], "last": cable.points[:, -3:]}.items():
+        frames = np.linalg.norm(three - np.roll(three, 1, axis=1), axis=2).argmax(axis=1).nonzero()[0]
+        if len(frames):
+            yield {"frames": frames, "detail": f"the {end} three in frames {spans(frames)}"}
+
+
 def hangs(cable: Cable) -> dict[str, Any] | None:
     """The cosine of the angle between the way that the cable sags and down, and the axis of the file along which it sags."""
-    deep = float(np.linalg.norm(sag := cable.sag()))
+    points, part = cable.points, (cable.along / cable.along[-1])[:, None]
+    # Mean place [3], m, of the inner markers from that on the line of the ends at their part of the length.
+    sag = (points - (1 - part) * points[:, :1] - part * points[:, -1:])[:, 2:-2].mean(axis=(0, 1))
+    deep = float(np.linalg.norm(sag))
     in_file = turn(cable.settings.up).T @ sag
     axis = int(np.abs(in_file).argmax())
     down, up = (f"{sign}{'xyz'[axis]}" for sign in ("+-" if in_file[axis] > 0 else "-+"))
@@ -201,10 +211,12 @@ checks = (
     Check("order along the cable", "cable in space", disordered, (0, DETOUR), "error",
           "markers must be in their order along one cable; received markers {one} and {two} {value:.1f} times as far apart as the "
           "longest step of the way over others; {next}", title=""),
-    Check("up of the recording", "cable under gravity", hangs, (HANGS, np.inf), "warning",
+    Check("order at the ends", "cable in motion", ends, None, "warning", "markers at an end are not in their order along the cable",
+          "Exchange two columns there, or leave the frames out.", effect="a controller is in another's position"),
+    Check("up of the recording", "cable in motion", hangs, (HANGS, np.inf), "warning",
           "a cable sags down; received one that sags by {cm:.0f} cm along {down}, with mocap.up {0.settings.up}. Set mocap.up: "
           "'{up}'", title=""),
-    Check("rate of the recording", "cable under gravity", swings, TURNED, "warning",
+    Check("rate of the recording", "cable in motion", swings, TURNED, "warning",
           "a cable should swing by gravity; received {value:.2f} times as much with mocap.rate {0.settings.rate:g} Hz. About "
           "{fits:g} Hz would fit: set mocap.rate, or look at mocap.unit", title=""),
 )

@@ -131,15 +131,13 @@ class ClipNumbers(OwnStudy):
     def records(self) -> pd.DataFrame:
         """Every transfer that has a record: how it ended, clips that it was to be judged on, files that it kept, in the results."""
         rows = []
-        runs = self._read[1].to_dict("records")  # type: ignore[assignment]
-        for run in runs:
+        for run in self._read[1].to_dict("records"):
             path = self.results / run["scenario"] / run["method"] / str(run["seed"]) / "transfer.json"
             record = None if run["reason"].startswith(DAMAGED) else StageRecord.load(path)
             frames = record.file("frames", path).relative_to(self.results).as_posix() if record and "frames" in record.files else ""
             targets = int(record.facts["targets"]) if record and record.facts else 0
             rows.append(run | {"label": self.labels[run["method"]], "targets": targets, "frames": frames})
-        columns = ["scenario", "method", "seed", "status", "reason", "label", "targets", "frames"]
-        return pd.DataFrame(rows, columns=columns)
+        return pd.DataFrame(rows, columns=["scenario", "method", "seed", "status", "reason", "label", "targets", "frames"])
 
     @cached_property
     def cells(self) -> pd.DataFrame:

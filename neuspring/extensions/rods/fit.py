@@ -110,9 +110,8 @@ class Variables:
             branches = np.stack([np.full(settings.slip, SLIP_SHARE), yields], axis=1)
             rod = replace(rod, slip=branches, slip_twist=1.0, damping=min(rod.damping, SLIP_DAMPING))
             twin = replace(twin, body=rod)
-        joints = len(held) - 2
-        along = _basis(rod, {"constant": "none"}.get(settings.stiffness, settings.stiffness), settings.knots)
-        bent = _basis(rod, {"straight": "none"}.get(settings.curvature, settings.curvature), settings.knots)
+        along = _basis(rod, {"constant": "straight"}.get(settings.stiffness, settings.stiffness), settings.knots)
+        bent = _basis(rod, settings.curvature, settings.knots)
         if settings.curvature != "free":
             # A field of the curvature per length.
             bent = bent * (rod.spans / rod.spans[1:-1].mean())[:, None]
@@ -125,7 +124,7 @@ class Variables:
         if settings.markers and rod.laid:
             sizes |= {"clamps": 3 * ends, "tilts": 2 * ends, "places": 3 * tracked}
         elif settings.markers and ends:
-            sizes |= {"clamps": 3 * ends, "offsets": 2 * int((~held).sum()), "stretch": joints - 1}
+            sizes |= {"clamps": 3 * ends, "offsets": 2 * int((~held).sum()), "stretch": len(held) - 3}
         return cls(twin, tracked, {name: size for name, size in sizes.items() if size}, along, bent)
 
     @property
@@ -147,7 +146,7 @@ class Variables:
         """The twin of variables q [Q]."""
         start, twin = rod_of(self.twin), self.twin
         factor = {name: np.exp(self.part(q, name)) for name in LOGARITHMIC}
-        bending, twisting = (start.bending * factor["bending"], start.twisting * factor["twisting"])
+        bending, twisting = start.bending * factor["bending"], start.twisting * factor["twisting"]
         if self.stiffness_along.shape[1]:
             bending = bending * np.exp(self.stiffness_along @ self.part(q, "bending_along"))
             twisting = twisting * np.exp(self.stiffness_along @ self.part(q, "twisting_along"))
@@ -226,14 +225,14 @@ def free_part(rod: Rod) -> tuple[float, float]:
 
 
 def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
-    """Functions along the arc at the vertices [V, n]: none, one per inner joint, or cubic splines between knots."""
-    joints = len(rod.mass) - 2
-    if kind == "none":
-        return np.zeros((joints + 2, 0))
+    """Functions along the arc at the vertices [V, n]: none (straight), one per inner joint, or cubic splines between knots."""
+    count = len(rod.mass)
+    if kind == "straight":
+        return np.zeros((count, 0))
     if kind == "free":
-        return np.eye(joints + 2)[:, 1:-1]
+        return np.eye(count)[:, 1:-1]
     if kind == "constant":
-        return np.ones((joints + 2, 1))
+        return np.ones((count, 1))
     from scipy.interpolate import CubicSpline
 
     arc, (low, high) = arc_of(rod.lengths), free_part(rod)
@@ -297,7 +296,7 @@ class Recordings:
             # Frames 1, 1 + every, ...
             kept.append(solver.advance(rows, slice((1 - first) % every, None, every))[:, :, :tracked].cpu())
         found = torch.cat(kept).transpose(0, 1).reshape(len(twins), count, -1, tracked, 3).numpy()
-        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10, posinf=LARGEST_ERROR * 10, neginf=-LARGEST_ERROR * 10))
+        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10))
 
 
 def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:

@@ -77,8 +77,9 @@ def rod_twin(observations: Observations, settings: config.Config, axis: Sequence
     if held is None:
         vertices = center_line(nodes, start.vertices, where)
         held = np.full(len(vertices), -1, np.int32)
-        reach = controller_reach(nodes, hands) + variables.controller_radius.start * node_spacing(nodes)
-        reach = variables.controller_radius.start if settings.search.lengths == "meter" else reach
+        reach = variables.controller_radius.start
+        if settings.search.lengths != "meter":
+            reach = controller_reach(nodes, hands) + reach * node_spacing(nodes)
         pairs = controller_springs(nodes, hands, reach, int(variables.controller_neighbors.start))
     else:
         vertices = line_of(observations)

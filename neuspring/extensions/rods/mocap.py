@@ -38,6 +38,7 @@ from neuspring.data.unpickle import load_pickle
 from neuspring.extensions.rods.checks import MIN_DISTANCE, MIN_FRAMES, in_space, look
 from neuspring.extensions.rods.rod import arc_of, pieces
 from neuspring.extensions.rods.settings import Mocap
+from neuspring.intake.points import in_both
 
 X, Y, Z = np.eye(3)
 
@@ -111,12 +112,10 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     samples = data[settings.start :: settings.stride].transpose(0, 2, 1)
     markers = samples if settings.frames is None else samples[: settings.frames]
     frames, count, _ = markers.shape
-    if frames < MIN_FRAMES:
-        rule = f"at least {MIN_FRAMES} frames must remain after mocap.start = {settings.start} and mocap.stride = {settings.stride}"
-        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Choose a smaller start or stride.")
-    if settings.frames is not None and frames < settings.frames:
-        rule = f"{settings.frames} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
-        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower mocap.frames.")
+    needed = settings.frames or MIN_FRAMES
+    if frames < needed:
+        rule = f"{needed} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower these settings.")
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
@@ -140,8 +139,6 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         for ends, stride in ((recorded, settings.stride), (back, 1))
     )
     visible = np.ones(observed.shape[:2], dtype=bool)
-    motion_valid = visible.copy()
-    motion_valid[-1] = False
     first = np.concatenate([observed[0] - before[2:-2], back[0] - back[1]]) * settings.rate
     nodes = len(observed[0]) + len(body)
     options = ", ".join(f"{name}={getattr(settings, name)}" for name in Mocap.__dataclass_fields__)
@@ -160,7 +157,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
         ),
         object_points=observed,
         object_visibility=visible,
-        object_motion_valid=motion_valid,
+        object_motion_valid=in_both(visible),
         controller_points=controllers,
         surface_points=body,
         interior_points=np.zeros((0, 3)),

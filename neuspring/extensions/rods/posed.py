@@ -16,6 +16,7 @@ from neuspring.config import Config, ScenarioRow
 from neuspring.core.artifacts import Observations, Scenario
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
+from neuspring.core.text import listed
 from neuspring.extensions.rods.mocap import RING, centerline, circle, rings, transport
 from neuspring.extensions.rods.settings import Posed
 from neuspring.intake.points import carried, in_both, taught_by
@@ -81,8 +82,7 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
 def _body(line: np.ndarray, normal: np.ndarray, settings: Posed) -> np.ndarray:
     """Nodes [n, 3], m, of rings along the part of a line [M, 3] that begins at the clamp."""
     centers, tangents = centerline(line[1:], RINGS)
-    nodes = rings(centers, tangents, transport(tangents, normal), settings.radius, RING)
-    return nodes
+    return rings(centers, tangents, transport(tangents, normal), settings.radius, RING)
 
 
 def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:
@@ -104,7 +104,7 @@ def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:
     known = [TIME, *settings.position, *settings.rotation]
     marked = [name for columns in settings.markers for name in columns]
     if missing := [name for name in (*known, *marked) if name not in table]:
-        remedy = f"Name columns in the section posed; there are {', '.join(map(str, table.columns[:12]))}."
+        remedy = f"Name columns in the section posed; there are {listed(table.columns)}."
         raise InputError(path, "columns of time, position, rotation and markers", f"none of {', '.join(missing)}", remedy)
     table = table[[*known, *marked]].apply(pd.to_numeric, errors="coerce").iloc[:: settings.stride]
     if len(table) < FEWEST_SAMPLES:
@@ -119,8 +119,8 @@ def _table(path: Path, settings: Posed) -> tuple[np.ndarray, np.ndarray, float]:
         rule = f"{TIME}: samples must follow each other evenly, within {UNEVEN:.0%}"
         raise InputError(path, rule, f"{steps[where]:.4g} s behind sample {where}, {step:.4g} elsewhere", "Resample the table.")
     turns, tracks = table[list(settings.rotation)].to_numpy(), table[marked].to_numpy().reshape(len(table), -1, 3)
-    if not settings.angles and np.abs(np.linalg.norm(turns, axis=1) - 1).max() > UNEVEN:
-        lengths = np.linalg.norm(turns, axis=1)
+    lengths = np.linalg.norm(turns, axis=1)
+    if not settings.angles and np.abs(lengths - 1).max() > UNEVEN:
         remedy = "Normalize them, or name the order of three angles in posed.angles."
         raise InputError(path, "quaternions have length 1", f"{lengths.min():.3g} to {lengths.max():.3g}", remedy)
     if len(lost := np.flatnonzero(~np.isfinite(tracks[0]).all(axis=1))):

@@ -112,8 +112,9 @@ class Deform(SettingsSection):
             if len(train) < self.clips or not judged:
                 rule = f"at least {self.clips} recordings train/NUMBER.pkl (deform.clips) and one eval/NUMBER.pkl are required"
                 there = listed(sorted({path.parent.parent.name for path in folder.parent.glob("*/eval/*.pkl")})) or "none"
-                received = f"{len(train)} and {len(judged)}"
-                raise InputError(folder, rule, received, f"Correct data_root, deform.cables (there: {there}) or clips.")
+                raise InputError(
+                    folder, rule, f"{len(train)} and {len(judged)}", f"Correct data_root, deform.cables (there: {there}) or clips."
+                )
             picked = [train[i * (len(train) - 1) // (self.clips - 1)] for i in range(self.clips)]
             pools[cable], transfers[picked[0]] = tuple(picked), tuple(judged)
             scenarios += [picked[0]] if picked[0] not in scenarios else []

@@ -15,9 +15,15 @@ def row_of(name: str) -> ScenarioRow | None:
     """The row of a recording of a cable: its name says where it lies, as DLO3_train_15 is DLO3/train/15.pkl."""
     if not (found := RECORDING.fullmatch(name)):
         return None
-    values = {"scenario": name, "source": "mocap", "category": found["cable"]}
-    values |= {"path": f"{found['cable']}/{found['part']}/{found['number']}.pkl"}
-    return parse(ScenarioRow, values | {"self_collision": False, "ground": False}, f"scenario {name}")
+    values = {
+        "scenario": name,
+        "source": "mocap",
+        "category": found["cable"],
+        "path": f"{found['cable']}/{found['part']}/{found['number']}.pkl",
+        "self_collision": False,
+        "ground": False,
+    }
+    return parse(ScenarioRow, values, f"scenario {name}")
 
 
 MOCAP = Source(module="neuspring.extensions.rods.mocap", reads=("data_root", "mocap"), row_of=row_of)

@@ -277,8 +277,8 @@ def strip(scene: Scene, folder: Path, shown: int = 6, width: int = 320) -> None:
     colors = film(scene.data / "phystwin22_films", scene.name)
     rows = [[colors[frame] for frame in frames], *([scene.renders(rival)[k] for k in places] for rival in RIVALS)]
     for folder_of_run in list(runs_of(scene, [BEST]).values())[:1]:
-        drawn = pictures(folder_of_run, scene.capture, frames)
-        rows.append([drawn[k][..., :3] + (0.3 * colors[k] * (1 - drawn[k][..., 3:] / 255)).astype(np.uint8) for k in frames])
+        if drawn := pictures(folder_of_run, scene.capture, frames):
+            rows.append([drawn[k][..., :3] + (0.3 * colors[k] * (1 - drawn[k][..., 3:] / 255)).astype(np.uint8) for k in frames])
     cut = np.argwhere(np.any([scene.labels(frame) == OBJECT for frame in frames], axis=0))
     (top, left), (bottom, right) = np.maximum(cut.min(axis=0) - 30, 0), cut.max(axis=0) + 30
     size = width, round(width * (bottom - top) / (right - left))

@@ -31,6 +31,7 @@ import multiprocessing
 import time
 from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +196,7 @@ def execute_all(runs: list[Run], folder: Path, jobs: int) -> list[dict[str, Any]
     """The records of all runs, in their order; `jobs` processes make those that are missing."""
     todo, clock = [run for run in runs if run.record(folder) is None], time.perf_counter()
     print(f"{len(runs) - len(todo)} of {len(runs)} runs are there, {len(todo)} to make", flush=True)
-    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+    with multiprocessing.get_context("spawn").Pool(jobs) if jobs > 1 else ThreadPool(jobs) as pool:
         records = pool.imap(functools.partial(execute, folder=folder), todo)
         for done, (run, record) in enumerate(zip(todo, records, strict=True), 1):
             text = ", ".join(f"{name} {value:.3g}" for name, value in record["values"].items()) or record["failure"]

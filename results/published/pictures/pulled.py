@@ -59,9 +59,9 @@ def pixels_of(positions: np.ndarray, points: np.ndarray, size: tuple[int, int]) 
     return ((pixels - [left, top]) / [right - left, bottom - top] * size).reshape(*points.shape[:-1], 2)
 
 
-def main(output: Path) -> None:
+def main() -> None:
     """Draw, crop, write."""
-    run = ns.load_run()
+    output, run = Path(sys.argv[1]), ns.load_run()
     assert run.trajectory is not None
     with tempfile.TemporaryDirectory() as name:
         folder, film = Path(name) / "twin", Path(name) / "film.gif"
@@ -91,4 +91,4 @@ def main(output: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

@@ -49,8 +49,9 @@ def facts(capture: Capture) -> dict[str, object]:
     }
 
 
-def main(results: Path, output: Path) -> None:
-    """Write contact_sheet.jpg and captures.csv to `output`."""
+def main() -> None:
+    """Write contact_sheet.jpg and captures.csv."""
+    results, output = map(Path, sys.argv[1:])
     captures = [Capture.load(path.parent) for path in sorted(results.glob(f"*/capture/{CAPTURE}"))]
     strips = [strip(capture) for capture in captures]
     blank = np.full_like(strips[0], 255)
@@ -60,8 +61,8 @@ def main(results: Path, output: Path) -> None:
     table = pd.DataFrame([facts(capture) for capture in captures])
     table.to_csv(output / "captures.csv", index=False)
     print(table.to_string(index=False))
-    print(f"{len(table)} captures, {table['seconds'].sum() / 60:.0f} minutes, {table['megabytes'].sum():.0f} MB")
+    print(f"{len(table)} captures, {table['megabytes'].sum():.0f} MB")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main()

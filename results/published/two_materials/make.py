@@ -4,6 +4,7 @@
     python -m results.published.two_materials.make tables DATA OUT                     # OUT/summary.md, OUT/stiffness.png
     python -m results.published.two_materials.make twisted FOLDER OUT [--cad DATA/cad] [--pictures "t_em_c__*.png"]
 
+`twisted` predicts by the fits in OUT of `hanging`; OUT/twisted.md has all rows, OUT/twisted.csv every one.
 DATA has images/, views.json and cad/ of the beams; FOLDER has pictures of twisted beams and their views.json. The beam is a lattice
 of the project, whose planes meet its faces and whose surface is the CAD's. Its equilibrium is found by Newton's method, to which
 a damped rollout of the simulator agrees within 1e-3 mm, and gradients are those of the balance of forces. The loss is the
@@ -15,7 +16,7 @@ hold it by 0.3 pixels.
 from __future__ import annotations
 
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -224,6 +225,8 @@ def of_rod(view: View, start: np.ndarray, q: np.ndarray, *, even: bool) -> Found
 
 BEAMS = {"h_e_c": ("Ecoflex", 1.8), "h_m_c": ("MoldStar", 4.8), "h_em_c": ("both", 2.2)}
 """Experiments: what they are made of, and a stiffness to start from, N."""
+PER_SPRING = ("springs", "field", "shuffled")
+"""Rows whose stiffness differs from spring to spring."""
 RATIOS = (1.5, 2.0, 2.5, 3.5, 6.0)
 """Ratios at which the loss is asked for."""
 
@@ -242,25 +245,29 @@ def young_per_newton(beam: Beam) -> float:
 
 
 def hanging(data: Path, out: Path, cad: Path, only: Sequence[str]) -> None:
-    """All fits; those that are in OUT/fits.csv are not made again."""
+    """All fits; those that are in OUT/fits.csv are not made again. OUT/springs has the springs of rows `PER_SPRING`, N."""
     beam = Beam(cad)
     held, path = Held(beam, beam.clamps[0]), out / "fits.csv"
-    done = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["beam", "picture", "row", "start"])
+    done: list[dict[Hashable, Any]] = pd.read_csv(path, dtype={"start": str}).to_dict("records") if path.exists() else []
     for name, (_, first) in BEAMS.items():
         for number, view in enumerate(views_of(beam, data, f"{name}__*.png")):
-            alone = done[done["row"] == "uniform"].groupby("beam")["left"].mean()
-            for row, start, fit in rows_of(view, held, name, first, number, alone):
-                known = (done["beam"] == name) & (done["picture"] == number) & (done["row"] == row) & (done["start"] == start)
-                if known.any() or (only and row not in only):
+            even = pd.DataFrame([line for line in done if line["row"] == "uniform"], columns=["beam", "left"])
+            for row, start, fit in rows_of(view, held, name, first, number, even.groupby("beam")["left"].mean()):
+                keys: dict[Hashable, Any] = {"beam": name, "picture": number, "row": row, "start": start}
+                if any(keys.items() <= line.items() for line in done) or (only and row not in only):
                     continue
                 found = fit()
-                line = {"beam": name, "picture": number, "row": row, "start": start, **found}
-                done = pd.concat([done, pd.DataFrame([line])], ignore_index=True)
-                done.to_csv(path, index=False, float_format="%.5g")
+                line = {**keys, **found}
                 along = pd.DataFrame({"x": found.place.round(), "y": np.log(found.stiffness)}).groupby("x")["y"].mean()
-                keys = {"beam": name, "picture": number, "row": row, "start": start}
                 table = pd.DataFrame({**keys, "x": along.index, "stiffness": np.exp(along.to_numpy())})
                 table.to_csv(out / "along.csv", mode="a", header=not (out / "along.csv").exists(), index=False, float_format="%.4g")
+                if row in PER_SPRING:
+                    every = np.full(len(beam.springs), np.nan, np.float32)
+                    every[held.kept] = found.stiffness
+                    (out / "springs").mkdir(exist_ok=True)
+                    np.save(out / "springs" / f"{name}_{number}_{row}_{start}.npy", every)
+                done.append(line)
+                pd.DataFrame(done).to_csv(path, index=False, float_format="%.5g")
                 print({k: v if isinstance(v, str) else round(float(v), 3) for k, v in line.items()}, flush=True)
 
 
@@ -298,7 +305,7 @@ def rows_of(
     for ratio in RATIOS:
         law = lambda p, ratio=ratio: p[0] + np.log(ratio) * part  # noqa: E731
         rows.append(("given_ratio", f"{ratio}", low(law, log - np.log(ratio) / 4)))
-    for kind in ("springs", "field", "shuffled"):
+    for kind in PER_SPRING:
         for seed in range(1 if kind == "springs" else 3):
             rows.append((kind, str(seed), lambda kind=kind, seed=seed: from_uniform(view, held, kind, seed, log)))
     rows.append(("rod", "0", lambda: of_rod(view, np.full(len(KNOTS), log + np.log(6e4)), still, even=False)))
@@ -345,20 +352,19 @@ class Twisted(Held):
 
 
 def twisted(folder: Path, out: Path, cad: Path, pattern: str) -> None:
-    """Predicted silhouettes of twisted beams, stiffness from OUT/fits.csv: OUT/twisted.csv, OUT/twisted/PICTURE.png.
+    """Predicted silhouettes of twisted beams, by fits of hanging ones: OUT/twisted.csv, OUT/twisted.md, OUT/twisted/PICTURE.png.
 
     The second clamp is turned by `TURN` and not moved (`given`), or both are fitted to the picture (`fitted`), since no marker is
-    on it. Stiffness is not fitted; `swapped` is the control in which the halves change places.
+    on it. Stiffness is not fitted: it is that of OUT/fits.csv and OUT/springs. `swapped` is the control in which the halves change
+    places.
     """
     beam, fits = Beam(cad), pd.read_csv(out / "fits.csv")
-    mean = fits.groupby(["beam", "row"])[["left", "right"]].mean()
-    lines = []
+    mean, lines = fits.groupby(["beam", "row"])[["left", "right"]].mean(), list[dict[str, Any]]()
     for view in views_of(beam, folder, pattern, (1, -1)):
         made = {"t_e_c": "h_e_c", "t_m_c": "h_m_c"}.get(view.name.partition("__")[0], "h_em_c")
-        for row in ("regions", "uniform", "swapped") if made == "h_em_c" else ("uniform",):
-            left, right = mean.loc[(made, "regions" if row == "swapped" else row)][:: -1 if row == "swapped" else 1]
+        for row, fit, every in known_of(beam, mean, out / "springs", made):
             held = Twisted(beam)
-            stiffness = regional(held)(torch.tensor([np.log(left), np.log(right)])).exp().numpy()
+            stiffness = every[held.kept]
             nodes = held.twist(TURN, 0.0, stiffness)
             given = TURN, 0.0, nodes, *posed(view, nodes, np.zeros(6))
             for clamp, (turn, shift, nodes, q, loss) in {
@@ -366,20 +372,42 @@ def twisted(folder: Path, out: Path, cad: Path, pattern: str) -> None:
                 "fitted": second_clamp(view, held, stiffness, given),
             }.items():
                 surface = beam.carried @ nodes
-                keys = {"picture": view.name, "row": row, "clamp": clamp, "turn": turn, "shift": shift, "loss": loss}
+                keys = {"picture": view.name, "row": row, "fit": fit, "clamp": clamp, "turn": turn, "shift": shift, "loss": loss}
                 lines.append(keys | view.scores(surface, q))
                 print(lines[-1], flush=True)
-                drawn(view, surface, q, out / "twisted" / f"{view.name}_{row}_{clamp}.png")
-    pd.DataFrame(lines).to_csv(out / "twisted.csv", index=False, float_format="%.5g")
+                drawn(view, surface, q, out / "twisted" / f"{view.name}_{row}_{fit}_{clamp}.png")
+    table = pd.DataFrame(lines)
+    table.to_csv(out / "twisted.csv", index=False, float_format="%.5g")
+    means = table.groupby(["row", "clamp"], sort=False)["outline"].mean().unstack("clamp")
+    rows = [[ROWS.get(str(row), str(row)), *(f"{outline:.1f}" for outline in own)] for row, *own in means.itertuples()]
+    head = ["twin", *(f"outline [px], second clamp {clamp}" for clamp in means)]
+    write_text(
+        out / "twisted.md", "\n".join(["# Twisted, mean over pictures and fits", "", *Table.of_texts(head, rows).markdown(), ""])
+    )
+
+
+def known_of(beam: Beam, mean: pd.DataFrame, springs: Path, made: str) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Row, fit and stiffness of all springs [S], N, by fits of the hanging beam `made`: means of halves, then each fit's own."""
+    part = np.clip(beam.middles[:, 0] * CELLS / (2 * THICK) + 0.5, 0, 1)
+    for row in ("regions", "uniform", "swapped") if made == "h_em_c" else ("uniform",):
+        left, right = mean.loc[(made, "regions" if row == "swapped" else row)][:: -1 if row == "swapped" else 1]
+        yield row, "mean", left ** (1 - part) * right**part
+    for path in sorted(springs.glob(f"{made}_*.npy")):
+        _, number, row, start = path.stem.rsplit("_", 3)
+        yield row, f"{number}-{start}", np.load(path).astype(float)
 
 
 Clamped = tuple[float, float, np.ndarray, np.ndarray, float]
 """Turn of the second clamp, degrees, and its shift, mm, nodes [N, 3], m, pose [6], and the loss."""
 
 
+SIZES = (1.0, 0.4, 0.2)
+"""Of steps to the second clamp's place, one after the other, over 4 mm and 10 degrees."""
+
+
 def second_clamp(view: View, held: Twisted, stiffness: np.ndarray, best: Clamped) -> Clamped:
     """The place of the second clamp with the lowest loss, axis by axis in steps that shrink."""
-    for size in (1.0, 0.4, 0.2):
+    for size in SIZES:
         for axis, step in ((1, 4.0), (0, 10.0), (1, 4.0), (0, 10.0)):
             tried = [best]
             for move in (-2, -1, 1, 2):

@@ -135,6 +135,19 @@ def test_lost_and_exchanged_markers(tmp_path):
     assert (found.name, found.level, found.frames) == ("labels swapped", "warning", (200,))
 
 
+@pytest.mark.parametrize(("first", "end"), [(0, "first"), (0, "last"), (300, "last")])
+def test_held_markers_exchanged_throughout_or_in_a_gap(tmp_path, first, end):
+    data = swinging()
+    pair = [0, 1] if end == "first" else [-1, -2]
+    data[:, :, pair[1]] += 0.7 * (data[:, :, pair[0]] - data[:, :, pair[1]])
+    data[first:, :, pair] = data[first:, :, pair[::-1]]
+    # As after lost samples, all markers step farther than the two are apart.
+    data[first:] += 0.03
+    (found,) = checked(tmp_path, data)
+    assert (found.name, found.level, found.frames) == ("order at the ends", "warning", tuple(range(first, 500)))
+    assert f"the {end} three in frames {first} to 499" in found.text
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="the released recordings are not part of the repository")
 @pytest.mark.parametrize("cable", ["DLO1", "DLO2", "DLO3", "DLO4"])
 def test_released_recordings_have_no_findings(cable):

@@ -123,7 +123,7 @@ def test_bad_recordings_are_refused(tmp_path, value, message):
     assert [d.level for d in check_layout(path) if d.level == "error"]
 
 
-@pytest.mark.parametrize(("settings", "message"), [(Mocap(stride=20), "stride = 20"), (Mocap(start=37), "mocap.start = 37")])
+@pytest.mark.parametrize(("settings", "message"), [(Mocap(stride=20), "stride 20"), (Mocap(start=37), "start 37")])
 def test_settings_that_do_not_fit_are_refused(tmp_path, settings, message):
     with pytest.raises(InputError, match=rf"7\.pkl: .*{message}"):
         mocap.read(ROW, write(tmp_path, recording()), settings)
