@@ -92,7 +92,8 @@ class Fit(SettingsSection):
     damping: Literal["fixed", "homogeneous"] = "fixed"
     """Training of the damping: none (fixed), or drag and one factor of all dashpots (homogeneous)."""
     plateau: NonNegative = 0.01
-    """Relative decrease of the loss of rollouts, in 40 epochs, below which the fit has converged and ends. 0: all epochs."""
+    """Fraction by which the loss of a twin's rollout must be lower than that of the result so far to replace it. A fit that has
+    found no such twin in 40 epochs has converged and ends. 0: any decrease, all epochs."""
     selection: Literal["rollout", "tail", "training_loss"] = "rollout"
     """Loss that chooses the twin: of its rollout over the training frames, or over the last fifth of them, on which nothing is
     fitted then; the search's twin is a candidate. training_loss: the mean seen while training, as in the released code."""

@@ -3,8 +3,8 @@
 An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the whole
 training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the
 state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every ROLLOUT_EVERY epochs a
-rollout of the parameters from rest gives the loss of a twin. The twin with the lowest is the result, the start among them: no fit
-ends behind its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends when
+rollout of the parameters from rest gives the loss of a twin. The result is the start, or the last twin whose loss is lower by a
+fraction `plateau` than that of the result before: no fit ends behind its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends when
 they have stopped falling. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient
 restores the parameters of the epoch's start, halves the learning rates and is reported.
 
@@ -56,7 +56,7 @@ TAIL_FRACTION = 0.2
 ROLLOUT_EVERY = 5
 """Epochs between two rollouts. All fits that share launches make theirs together."""
 PLATEAU_EPOCHS = 40
-"""Epochs in which the lowest loss of rollouts must fall by `fit.plateau`, else the fit has converged."""
+"""Epochs without a better twin after which a fit has converged."""
 MOST_GROWTH = 8
 """Substeps at most, as a multiple of the search's: a few springs that stiffen without end would set the cost of all."""
 MAX_ROLLBACKS = 5
@@ -149,6 +149,10 @@ class _State:
     overflow: int = 0
     gradient_over_epsilon: float | None = None
     """Median |gradient| per step over Adam's epsilon, in the first epoch in which the median is not zero."""
+
+    def converged(self, epochs: int, plateau: float) -> bool:
+        """True where the last PLATEAU_EPOCHS of so many epochs have brought no better twin."""
+        return plateau > 0 and epochs > self.best_epoch + PLATEAU_EPOCHS
 
     def checkpoint(self) -> Checkpoint:
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in FIT_ARRAYS}
@@ -451,7 +455,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     run.use_substeps(state.substeps)
     run.restore(state.values, state.moments)
     for epoch in loop:
-        if len(state.rollbacks) >= MAX_ROLLBACKS or converged(loop.history, state.search_loss, problem.fit.plateau):
+        if len(state.rollbacks) >= MAX_ROLLBACKS or state.converged(len(loop.history), problem.fit.plateau):
             break
         row = yield from _advance(run, state, problem, epoch)
         state.overflow = overflow + run.collision_overflow
@@ -476,7 +480,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         "search_loss": state.search_loss if math.isfinite(state.search_loss) else None,
         "running_loss": loop.history[state.best_epoch]["loss"] if state.best_epoch >= 0 else None,
         "rollout_loss": loss if math.isfinite(loss) else None,
-        "converged": converged(loop.history, state.search_loss, problem.fit.plateau),
+        "converged": state.converged(len(history), problem.fit.plateau),
         "epochs": len(history),
         "epochs_asked": problem.fit.epochs,
         "rollbacks": state.rollbacks,
@@ -512,20 +516,6 @@ def _rollout_or_infinite(run: TwinFit) -> Generator[Any, Any, float]:
     return math.inf
 
 
-def converged(history: Sequence[Mapping[str, Any]], start: float, plateau: float) -> bool:
-    """True where the lowest loss of rollouts has fallen by less than a fraction `plateau` in the last PLATEAU_EPOCHS epochs.
-
-    `start` is the loss before the first epoch.
-    """
-
-    def lowest(rows: Sequence[Mapping[str, Any]]) -> float:
-        return min([start, *(float(row["rollout_loss"]) for row in rows if row["rollout_loss"] is not None)])
-
-    before = history[:-PLATEAU_EPOCHS]
-    due = len(history) >= PLATEAU_EPOCHS and len(history) % ROLLOUT_EVERY == 0
-    return plateau > 0 and due and lowest(history) > (1 - plateau) * lowest(before)
-
-
 def _growth(values: np.ndarray, reference: np.ndarray) -> float:
     """The largest ratio of `values` to `reference` [S], both >= 0; infinite where something grew from nothing."""
     ratio = np.divide(values, reference, out=np.where(values > 0, np.inf, 0.0), where=reference > 0)
@@ -554,7 +544,9 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
         state.substeps = run.twin.simulation.substeps
         row |= losses
         loss = losses["loss"] if released else losses.get("rollout_loss", math.inf)
-        if eligible(epoch, problem) and loss < state.best_loss:
+        # Losses of rollouts scatter: a later twin must be better by more than that.
+        least = 0.0 if released else problem.fit.plateau
+        if eligible(epoch, problem) and loss < (1 - least) * state.best_loss:
             state.best_loss, state.best_epoch = loss, epoch
             state.best_values, state.best_substeps = state.values, state.substeps
     except NonFinite as failure:

@@ -23,6 +23,7 @@ from itertools import count
 
 import cv2
 import numpy as np
+from scipy import ndimage
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +39,8 @@ CORNER_EDGE = 2
 """px: corners are this far within the mask, so that its own outline is not followed."""
 CORNERS_AGAIN = 0.4
 """Share of the corners of frame 0 that must agree, at least twice LEAST_CORNERS, for a frame to be one like frame 0."""
+STEADY = 5
+"""Frames like frame 0 whose median says what the way had missed."""
 CORNER_BACKWARD = 0.7
 """px by which a corner may miss its start."""
 CORNER_WINDOW = 15
@@ -157,7 +160,9 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
         if pose is not None:
             missed[frame] = pose - poses[frame]
             known.append(frame)
-    spread = [np.interp(np.arange(frames), known, column) for column in missed[known].T]
+    # One that is like frame 0 in few corners may be wrong.
+    steady = ndimage.median_filter(missed[known], (STEADY, 1))
+    spread = [np.interp(np.arange(frames), known, column) for column in steady.T]
     return poses + np.stack(spread, axis=1), lost
 
 
