@@ -145,7 +145,7 @@ class Graph:
         if parameter.many and parameter.type is Observations:
             others = [SimpleNamespace(scenario=other) for other in getattr(rows, name)]
             return [Step(one, other) for one in makers("observations") for other in others]
-        if parameter.many and rows.method and rows.method.mean_of:
+        if parameter.many and rows.method and rows.method.mean_of and "seed" in makers(name)[0].wildcards:
             seeds = [SimpleNamespace(scenario=job.scenario, method=rows.method.mean_of, seed=seed) for seed in self.whole.seeds]
             return [Step(one, other) for other in seeds for one in makers(name) if one.when(self.rows(other))]
         if not (found := [one for one in makers(name) if one.when(rows)]):

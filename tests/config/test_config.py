@@ -63,19 +63,16 @@ MISTAKES = {
     ),
     "number for a truth": ("tracking: {enabled: 1}", "tracking.enabled", "received 1"),
     "nothing for a number": ("fit: {learning_rate: }", "fit.learning_rate", "received None"),
-    "infinite rate": ("fit: {learning_rate: .inf}", "fit.learning_rate", "finite"),
     "reversed range": (
         "search: {variables: {drag: {low: 5, high: 1}}}",
         "search.variables",
         "drag: 0 <= low < high is required, received [5.0, 1.0]",
     ),
-    "infinite range": ("search: {variables: {drag: {high: .inf}}}", "search.variables.drag.high", "finite"),
     "always tied": (
         "search: {rollouts: 9, tied_rollouts: 9}",
         "tied_rollouts must be below rollouts (9), received 9",
     ),
     "start outside": ("search: {variables: {drag: {start: 60}}}", "variables.drag: start = 60.0 lies outside [0.05, 50.0]"),
-    "clamp reversed": ("fit: {stiffness_range: [5, 1]}", "stiffness_range", "received [5.0, 1.0]"),
     "log scale from zero": (
         "search: {variables: {stiffness: {low: 0.0}}}",
         "variables.stiffness: scale log needs a positive low, received 0.0",
@@ -90,7 +87,6 @@ MISTAKES = {
         "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",
         "***@host",
     ),
-    "a word for twins in a launch": ("twins_per_launch: all", "twins_per_launch", "'auto'", "received 'all'"),
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),
     "a word among seeds": ("seeds: 0,a", "seeds: integers separated by commas are required, as in seeds=0,1,2, received '0,a'"),
     "a date": ("results: 2026-01-01", "values must be plain YAML"),

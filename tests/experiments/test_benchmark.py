@@ -381,6 +381,8 @@ def test_a_mean_reads_the_predictions_of_all_seeds_of_a_row(tmp_path):
     assert variant(graph, job) == {"mean_of": "unseen"}
     alone = pooled(tmp_path, methods=["mean"], scenarios=["a", "cloth"])
     assert list(alone.whole_left_out["mean"]) == ["cloth"]
+    filmed = shipped("synthetic") | {"extra_rows": {"ours": "config/rows/ours.yaml"}, "methods": ["model_b_wide_mean"]}
+    assert Graph(Benchmark(filmed, ROOT)).runs(), "masks are of cameras, not of seeds"
 
 
 def test_scenarios_without_a_pool_are_left_out_of_its_methods(tmp_path):
