@@ -307,8 +307,8 @@ def settings_table(runs: pd.DataFrame, names: Callable[[str], str]) -> list[Tabl
 
 
 def cost_table(numbers: Compared) -> Table:
-    """Median wall time and peak memory of each stage per method."""
-    units = {"time": "{:.1f} s", "memory": "{:.0f} MB"}
+    """Median wall time, peak memory and epochs of each stage per method, and whether half of its fits have converged."""
+    units = {"time": "{:.1f} s", "memory": "{:.0f} MB", "epochs": "{:.0f} epochs", "converged": "{:.0%} converged"}
     rows = numbers.table.task(*units).groupby(["method", "metric", "task"], sort=False)["value"].median()
     stages = list(dict.fromkeys(rows.index.get_level_values("metric")))
     known, made = rows.to_dict(), []
@@ -316,7 +316,7 @@ def cost_table(numbers: Compared) -> Table:
         keys = [[((method, stage, task), unit) for task, unit in units.items()] for stage in stages]
         parts = [", ".join(unit.format(known[key]) for key, unit in own if key in known) for own in keys]
         made.append([numbers.name(method), *(part or DASH for part in parts)])
-    return Table.of_texts(["Method", *stages], made, "Time and memory (medians)")
+    return Table.of_texts(["Method", *stages], made, "Time, memory, epochs (medians)")
 
 
 def ratios_drawn(numbers: Compared) -> tuple[str, Figure] | None:

@@ -6,7 +6,7 @@ the scores.csv and runs.csv that `neuspring tables` wrote. Tasks of its rows:
 - reconstruction, future: scores of finished and failed runs; transfer: means over other recordings of the same object.
 - reconstruction_held, future_held: scores of a failed run whose last finite frame stands until the end.
 - start: errors in frame 0, where the prediction is given.
-- time [s], memory [MB]: costs; the metric is the stage.
+- time [s], memory [MB], epochs, converged (0 or 1): costs; the metric is the stage.
 """
 
 from __future__ import annotations
@@ -197,6 +197,8 @@ def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
     facts = [("start", name, value, "m", 1) for name, value in record.floors.items()]
     facts += [("time", stage, value, "s", 0) for stage, value in record.timings.items()]
     facts += [("memory", stage, value, "MB", 0) for stage, value in record.peak_memory_mb.items()]
+    ends = {name: record.params.get(f"fit.result.{name}") for name in ("epochs", "converged")}
+    facts += [(name, "fit", float(value), "", 0) for name, value in ends.items() if value is not None]
     identity = {name: getattr(record, name) for name in ("scenario", "category", "method", "seed")}
     tables.append(pd.DataFrame(facts, columns=["task", "metric", "value", "unit", "frames"]).assign(**identity))
     return _with_run(stacked(tables))

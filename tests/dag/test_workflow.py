@@ -46,7 +46,7 @@ def test_a_configuration_becomes_a_table_with_every_run_in_mlflow(tiny_run):
     assert "(`baseline`)" in output
     assert "neuspring ui --results results" in output
     scores = pd.read_csv(results / "tables" / "scores.csv")
-    assert {"time", "memory"} < set(scores["task"])
+    assert {"time", "memory", "converged"} < set(scores["task"])
     assert np.isfinite(scores["value"]).all()
     scores = scores[scores["task"].isin(TASKS)]
     found = set(scores["metric"])
