@@ -1,12 +1,13 @@
 """First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
 
-An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the whole
-training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit` lets it; the
-state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every ROLLOUT_EVERY epochs a
-rollout of the parameters from rest gives the loss of a twin. The result is the start, or the last twin whose loss is lower by a
-fraction `plateau` than that of the result before: no fit ends behind its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends when
-they have stopped falling. Test frames are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient
-restores the parameters of the epoch's start, halves the learning rates and is reported.
+An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the
+whole training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit`
+lets it; the state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every
+ROLLOUT_EVERY epochs a rollout of the parameters from rest gives the loss of a twin. The result is the start, or the last twin
+whose loss is lower by a fraction `plateau` than that of the result before: no fit ends behind its search. Rollouts count the
+frames that are trained on, or a held-back tail of the training frames. A fit ends when they have stopped falling. Test frames
+are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the parameters of the epoch's
+start, halves the learning rates and is reported.
 
 What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
 is recorded is in m^2.

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pandas as pd
+from scipy.io import savemat
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, Delaunay
 
@@ -227,11 +228,24 @@ def of_renders(folder: Path) -> StandIn:
     return StandIn([[folder, folder / "work", "--cores", 0, "--output", folder / "out", "--strips", folder / "out"]])
 
 
+def of_cloth(folder: Path) -> StandIn:
+    """A sheet of 7 x 7 nodes that leans and does not move, and a prediction in which it has no size."""
+    x, z = np.mgrid[:7, :7][::-1]
+    states = np.stack([x, 0.1 * z, z]).reshape(147, 1)
+    savemat(folder / "SOMtraj8_1_10ms.mat", {"SOMrec": {"states": np.tile(states, (2, 40))}})
+    run = folder / "results" / "cloth_8_1" / "search_only" / "0"
+    run.mkdir(parents=True)
+    np.savez(run / "transfer_positions.npz", cloth_8_1=np.zeros((10, 42, 3)))
+    captures = ["captures", folder, folder / "captures"]
+    return StandIn([captures, ["tables", folder, folder / "out", "--results", folder / "results"]])
+
+
 STAND_INS: dict[str, Callable[[Path], StandIn]] = {
     "beam.make": of_beam,
     "bench.__main__": lambda folder: StandIn([["--quick", "--only", "frame", "--device", "cpu"]], {"bench.table.ROOT": folder}),
     "bench.splats": lambda folder: StandIn([["--repeats", 1]], {"bench.splats.SIZES": ((53, 30),), "bench.splats.COUNTS": (100,)}),
     "bench.spring_gaus": lambda folder: StandIn([[]], {"bench.spring_gaus.REPEATS": 1}),
+    "cloth.make": of_cloth,
     "film22.films": of_films,
     "film22.make": of_renders,
     "foam.make": of_foam,

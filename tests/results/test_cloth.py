@@ -2,17 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.io import savemat
 
 from results.published.cloth.make import capture, error, read
+from results.published.stand_ins import of_cloth
 
 
 def test_a_leaning_sheet_becomes_a_plumb_capture_whose_error_counts_free_nodes(tmp_path):
-    x, z = np.mgrid[:7, :7][::-1]
-    places = np.stack([x, 0.1 * z, z]).reshape(147, 1)
-    path = tmp_path / "SOMtraj8_1_10ms.mat"
-    savemat(path, {"SOMrec": {"states": np.tile(places, (2, 40))}})
-    mesh = read(path)
+    of_cloth(tmp_path)
+    mesh = read(path := tmp_path / "SOMtraj8_1_10ms.mat")
     assert np.ptp(mesh[..., 1]) == pytest.approx(0, abs=1e-9)
     assert capture(path, tmp_path, corners=False) == "cloth_8_1"
     nodes = mesh[:, :6].reshape(10, 42, 3)
