@@ -68,7 +68,7 @@ def view_of_table(rig: Rig) -> Iterator[dict[str, Any]]:
     for name, camera in rig.cameras.items():
         eye = camera.camera_to_world[:3, 3]
         center = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-        ray = camera.lift(center, np.ones(())) - eye
+        ray = camera.rays(center)
         above = up_sign(rig.up) * eye[2] > 0 and eye[2] * ray[2] < 0
         value = float(np.linalg.norm(ray) * -eye[2] / ray[2]) if above else 0.0
         yield {"where": f"camera {name}", "value": value, "detail": f"camera at z = {eye[2]:.2f} m, up {rig.up}"}

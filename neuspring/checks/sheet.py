@@ -96,7 +96,7 @@ def _measured(capture: Capture, name: str, frame: int) -> np.ndarray:
 def _grid(image: np.ndarray, camera: Camera, scale: float, up: float) -> None:
     """The table around the point that the image's center sees, and the axes of the world at its origin."""
     eye = camera.camera_to_world[:3, 3]
-    ray = camera.lift(np.array([camera.width, camera.height]) / 2, np.ones(())) - eye
+    ray = camera.rays(np.array([camera.width, camera.height]) / 2)
     middle = eye - ray * eye[2] / ray[2] if ray[2] * eye[2] < 0 else np.zeros(3)
     middle = np.round(middle[:2] / SQUARE) * SQUARE
     steps, ends = SQUARE * np.arange(-5, 6), SQUARE * 5 * np.array([-1.0, 1.0])

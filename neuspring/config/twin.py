@@ -73,6 +73,8 @@ class Fit(SettingsSection):
     """Adam's learning rate of log stiffness per spring, or of the field's weights."""
     factor_learning_rate: Positive | None = None
     """Learning rate of drag and common factors; null: `learning_rate`."""
+    decay_epochs: NonNegative = 0.0
+    """Epochs tau of the decay of all learning rates, to rate / (1 + epoch / tau); 0: none."""
     epsilon: Positive = 1e-15
     """Adam's epsilon, in the loss unit; released: 1e-8 m^2. Gradients far below it are not followed."""
     loss_unit: Literal["spacing", "meter"] = "spacing"

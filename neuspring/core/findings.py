@@ -66,11 +66,6 @@ def broken(file: Path, key: str, rule: str, value: object = None) -> Finding:
     return _of_file(file, "error", key, rule, value)
 
 
-def unusual(file: Path, key: str, rule: str, value: object = None) -> Finding:
-    """A warning: `key` of `file` departs from `rule`; `value` was received."""
-    return _of_file(file, "warning", key, rule, value)
-
-
 def note(file: Path, message: str) -> Finding:
     """A measurement or a skipped check."""
     return _of_file(file, "note", "", message, None)

@@ -45,9 +45,12 @@ class Camera:
 
     def lift(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [..., 3], m, of pixels (x, y) [..., 2] at depth [...], m along the optical axis: c2w (z K^-1 [x, y, 1])."""
-        ones = np.ones((*np.shape(depth), 1))
-        rays = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
-        return np.asarray((rays * np.asarray(depth)[..., None]) @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3])
+        return np.asarray(self.rays(pixels) * np.asarray(depth)[..., None] + self.camera_to_world[:3, 3])
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Directions [..., 3] in the world of the rays of pixels (x, y) [..., 2], each 1 m long along the optical axis."""
+        homogeneous = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
+        return np.asarray(homogeneous @ (self.camera_to_world[:3, :3] @ np.linalg.inv(self.intrinsics)).T)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (x, y) [..., 2] and depth [...], m, of world points [..., 3]; pixels are meaningless for depth <= 0."""

@@ -6,7 +6,7 @@
                                        0: none; not there with `depth: none`
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands, 3 person
     tracks.json                        optional: [K][T] of [x, y, z] m in the world, or null where not annotated; see `tracks`
-    controllers.npz|csv, nodes.npz|ply optional: hands in all frames and the body of frame 0, m in the world (points.py)
+    controllers.npz|csv, nodes.npz|ply, rest.npz optional: hands in all frames, the body of frame 0, its unloaded shape (points.py)
     points.json                        optional, for scoring alone: {camera: [K][T] of [x, y] pixels, or null where not marked}
 
 Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
@@ -45,7 +45,7 @@ from neuspring.data.camera import Camera, CameraEntry
 from neuspring.data.images import make_way, read_array, read_image, write_image
 
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
-CONTROLLERS, NODES = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply")
+CONTROLLERS, NODES, REST = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply"), "rest.npz"
 RECIPE = ".make-capture.json"
 """Recipe of a folder that make-capture has not finished. It is removed at the end."""
 NOTHING, OBJECT, HANDS, PERSON = 0, 1, 2, 3

@@ -4,6 +4,7 @@
                        poses [T, H, 4, 4], hands to world; optional: jaws [H, C, 3], points that each carries, holds [T, H]
     controllers.csv    points as rows, header frame,point,x,y,z[,holds][,hand]; frames from 0, holds 0 or 1
     nodes.npz | .ply   points [N, 3]; or vertices: the body of frame 0
+    rest.npz           points [K + N + C, 3], optional, without cameras: annotated points, nodes, controllers of the unloaded shape
     tracks.json        annotated points (capture.py); with `tracks: train` those of training frames teach the twin
 
 Meters, in the capture's world. Files of another form, in other units or axes are refused with what they look like.
@@ -31,7 +32,7 @@ from neuspring.core.findings import Finding, broken, refusal, refuse
 from neuspring.core.geometry import on_table
 from neuspring.core.records import digest_file
 from neuspring.data.c3d import Markers, is_c3d
-from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, REST, TRACKS, Capture, Description
 
 CSV_COLUMNS = ("frame", "point", "x", "y", "z", "holds", "hand")
 """Columns of controllers.csv; the last two may be left out."""
@@ -71,12 +72,13 @@ class InSpace:
     """[T, K, 3], m, NaN where not annotated: those that teach the twin; K = 0 where they are for scoring only."""
     annotated: np.ndarray
     """[T, K, 3], m, NaN where not annotated: all of them."""
+    rest: np.ndarray
+    """[K + N + C, 3], m: annotated points, nodes and controllers of the unloaded shape; none: frame 0 has no load."""
 
     def turned(self, rotation: np.ndarray) -> InSpace:
         """All points after a rotation [3, 3] about the origin."""
         hands = replace(self.hands, points=self.hands.points @ rotation.T) if self.hands else None
-        nodes, tracks, annotated = (points @ rotation.T for points in (self.nodes, self.tracks, self.annotated))
-        return InSpace(hands, nodes, tracks, annotated)
+        return InSpace(hands, *(points @ rotation.T for points in (self.nodes, self.tracks, self.annotated, self.rest)))
 
 
 def given(folder: Path, names: tuple[str, ...]) -> Path | None:
@@ -118,9 +120,14 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
     annotated = attempt(capture.tracks, marked)
     nodes, annotated = none[0] if nodes is None else nodes, none if annotated is None else annotated
+    rest: Any = none[0]
+    if hands is not None and (shape := folder / REST).exists():
+        known = annotated.shape[1], len(nodes), hands.points.shape[1]
+        rest = attempt(read_rest, shape, sum(known), description)
+        rest = none[0] if rest is None else rest
     # A hand may be anywhere while it holds nothing.
     held_at = none if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
-    space = InSpace(hands, nodes, annotated if description.tracks == "train" else none, annotated)
+    space = InSpace(hands, nodes, annotated if description.tracks == "train" else none, annotated, rest)
     moving = [Moving(points, description.frame_rate) for points in (annotated, held_at)]
     for where, one, remedy in zip((marked, file), moving, UNSEEN_ROW, strict=True):
         findings += examine("moving", where, one, remedy) if one.given.size else []
@@ -207,6 +214,17 @@ def read_nodes(path: Path) -> np.ndarray:
         value = f"{len(pairs)} pairs, first nodes {pairs[0][0]} and {pairs[0][1]}"
         raise InputError(path, rule, value, "Remove the doubled nodes, np.unique(points, axis=0).")
     return nodes
+
+
+def read_rest(path: Path, count: int, description: Description) -> np.ndarray:
+    """The unloaded shape [count, 3], m. Raises InputError."""
+    if description.cameras:
+        raise InputError(path, "an unloaded shape is for captures without cameras", "cameras", "Remove the file.")
+    points = _places(path, _arrays(path, ("points",))["points"], 2)
+    if len(points) != count:
+        rule = f"points: the annotated points, the nodes and the controllers are required, {count} in this order"
+        raise InputError(path, rule, len(points))
+    return points
 
 
 def _of_poses(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -330,11 +348,12 @@ def held(hands: Hands, tracks: np.ndarray, train_end: int) -> np.ndarray:
     return points
 
 
-def standing(nodes: np.ndarray, up: float) -> np.ndarray:
-    """Nodes [n, 3], m, with those below the table moved up to it; of those that meet there one stays."""
+def standing(nodes: np.ndarray, up: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [n, 3], m, with those below the table moved up to it, and their indices; of those that meet there one stays."""
     lifted = on_table(nodes, up)
     pairs = cKDTree(lifted).query_pairs(SAME, output_type="ndarray")
-    return np.delete(lifted, np.unique(pairs.max(axis=1)), axis=0) if len(pairs) else lifted
+    stay = np.setdiff1d(np.arange(len(nodes)), pairs.max(axis=1, initial=-1))
+    return lifted[stay], stay
 
 
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
@@ -347,10 +366,15 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
     description, space = capture.description, read(capture)
     assert space.hands is not None, "read has refused a capture without hands"
     points, visible = taught_by(space.tracks)
-    nodes = space.nodes
+    nodes, stay = space.nodes, np.arange(len(space.nodes))
     if row.ground:
-        points, nodes = on_table(points, description.up_sign), standing(nodes, description.up_sign)
-    nodes = nodes[cKDTree(points[0]).query(nodes)[0] > SAME]
+        points = on_table(points, description.up_sign)
+        nodes, stay = standing(nodes, description.up_sign)
+    apart = cKDTree(points[0]).query(nodes)[0] > SAME
+    rest = space.rest
+    if len(rest):
+        marked, body, hands = np.split(rest, np.cumsum([space.tracks.shape[1], len(space.nodes)]))
+        rest = np.concatenate([marked[np.isfinite(space.tracks[0]).all(axis=1)], body[stay[apart]], hands])
     return Observations(
         scenario=scenario_of(row, capture, {}),
         object_points=points,
@@ -359,16 +383,17 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
         controller_points=held(space.hands, space.tracks, capture.train_end),
         controller_valid=space.hands.holds,
         controller_hand=space.hands.hand,
-        surface_points=nodes,
+        surface_points=nodes[apart],
         interior_points=np.zeros((0, 3)),
         tracks=space.tracks,
+        rest_shape=rest,
     )
 
 
 def scenario_of(row: ScenarioRow, capture: Capture, origin: dict[str, str]) -> Scenario:
     """The scenario of a capture. Its provenance is the capture's, digests of the files that are there, and `origin`."""
     described, folder = capture.description, capture.folder
-    files = [name for name in (CAPTURE, *CONTROLLERS, *NODES) if (folder / name).exists()]
+    files = [name for name in (CAPTURE, *CONTROLLERS, *NODES, REST) if (folder / name).exists()]
     files += [TRACKS] if described.tracks == "train" else []
     return Scenario(
         name=row.scenario,

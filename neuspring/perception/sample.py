@@ -46,7 +46,7 @@ def assemble(
     # In the image every node should have a track that is followed for long.
     followed = None if image is None else image.visible[: capture.train_end].sum(axis=0)
     if given := len(space.nodes):
-        nodes = standing(space.nodes, up) if row.ground else space.nodes
+        nodes = standing(space.nodes, up)[0] if row.ground else space.nodes
         rank = lifted.object_visibility[: capture.train_end].sum(axis=0) if followed is None else followed
         indices, kept = among(on_table(lifted.object_points[0], up), rank, nodes)
         surface, interior, voxel = nodes[kept], nodes[:0], spacing(nodes)

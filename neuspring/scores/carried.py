@@ -169,7 +169,7 @@ def means(errors: np.ndarray, known: np.ndarray, none: float = np.nan) -> np.nda
 
 def _on_plane(camera: Camera, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
     """World points [n, 3], m, at which the rays of pixels [n, 2] meet the planes at z [n], m."""
-    rays = camera.lift(pixels, np.ones(len(pixels))) - camera.camera_to_world[:3, 3]
+    rays = camera.rays(pixels)
     return camera.lift(pixels, (z - camera.camera_to_world[2, 3]) / rays[:, 2])
 
 

@@ -39,7 +39,7 @@ from neuspring.physics.solver import AdjointLimit
 from neuspring.twin.batch import FrameRequest, GradientRequest, SharedFrames, SimulatedTwin, lockstep, result_of, shared_physics
 from neuspring.twin.body import FitTask, Learned, body_of
 from neuspring.twin.losses import FrameLoss, frames_seen
-from neuspring.twin.parameters import TwinParameters, movement, start_values, topology_spacing, watched
+from neuspring.twin.parameters import TwinParameters, movement, start_values, topology_spacing
 from neuspring.twin.rollout import initial_velocity
 from neuspring.twin.transfer import move
 
@@ -148,8 +148,6 @@ class _State:
     best_substeps: int
     substeps: int
     overflow: int = 0
-    gradient_over_epsilon: float | None = None
-    """Median |gradient| per step over Adam's epsilon, in the first epoch in which the median is not zero."""
 
     def converged(self, epochs: int, plateau: float) -> bool:
         """True where the last PLATEAU_EPOCHS of so many epochs have brought no better twin."""
@@ -302,8 +300,6 @@ class TwinFit:
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
         """Loss units per m^2."""
-        self.gradients: list[float] | None = None
-        """The median |gradient| of each step is put here, if it is wanted."""
 
     @property
     def twin(self) -> Twin:
@@ -327,7 +323,7 @@ class TwinFit:
         self.use_substeps(max(one.twin.simulation.substeps for one in self.recordings))
 
     def set_rate(self, rate: float) -> None:
-        """Set the learning rates: the settings' times `rate` (halved by rollbacks)."""
+        """Set the learning rates: the settings' times `rate` (halved by rollbacks, and decaying)."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group["base_rate"]
 
@@ -387,9 +383,6 @@ class TwinFit:
         norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
         if not bool(torch.isfinite(norm)):
             raise NonFinite(f"the gradient is not finite in frames {window.start} to {window.stop - 1}")
-        if self.gradients is not None:
-            gradient = watched(self.parameters).grad
-            self.gradients.append(0.0 if gradient is None else float(gradient.abs().median()))
         self.optimizer.step()
         return float(norm)
 
@@ -472,8 +465,6 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         loss = yield from _rollout_or_infinite(run)
     best = run.parameters.as_twin(run.twin)
     history, figures = pd.DataFrame(loop.history), movement(run.parameters)
-    if state.gradient_over_epsilon is not None:
-        figures["gradient_over_epsilon"] = state.gradient_over_epsilon
     frames, counts = problem.frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
@@ -530,14 +521,12 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "rollout_loss": None, "gradient_norm": None}
     row["frames_left_out"] = 0
-    run.set_rate(state.rate)
+    decay = problem.fit.decay_epochs
+    run.set_rate(state.rate / (1 + epoch / decay) if decay else state.rate)
     row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
-        run.gradients = [] if state.gradient_over_epsilon is None else None
         losses = yield from run.epoch()
         run.require_stable()
-        if run.gradients and (median := float(np.median(run.gradients))):
-            state.gradient_over_epsilon = median / problem.fit.epsilon
         released = problem.fit.selection == "training_loss"
         if not released and ((epoch + 1) % ROLLOUT_EVERY == 0 or epoch == problem.fit.epochs - 1):
             losses["rollout_loss"] = yield from run.rollout_loss()

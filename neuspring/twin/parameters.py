@@ -176,15 +176,6 @@ NEAR_BOUND = 0.95
 """A spring is at its bound beyond this fraction of it."""
 
 
-def watched(parameters: TwinParameters) -> torch.Tensor:
-    """The values whose gradients are compared with Adam's epsilon: offsets of springs, texels, or the field's first layer."""
-    field = parameters.field
-    if field is None:
-        assert parameters.offsets is not None
-        return parameters.offsets
-    return field.planes.texels if field.planes is not None else next(iter(field.layers[0].parameters()))
-
-
 def movement(parameters: TwinParameters) -> dict[str, Any]:
     """Figures of the present values against those before the first step; those that do not apply are left out.
 

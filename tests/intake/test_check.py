@@ -1,6 +1,7 @@
 """check-data on cases, C3D files and folders: what the readers refuse, with file and key."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from neuspring.config import Config
 from neuspring.core.errors import InputError
-from neuspring.core.findings import broken, note, unusual
+from neuspring.core.findings import broken, note
 from neuspring.intake import check, phystwin_raw
 from neuspring.intake.check import Layout, check_layout, render
 from neuspring.registry import Registry
@@ -157,6 +158,6 @@ def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path):
 
 def test_render_groups_by_file():
     one, two = Path("b.pkl"), Path("a.pkl")
-    text = render([broken(one, "", "x"), note(two, "y"), unusual(one, "", "z")])
+    text = render([broken(one, "", "x"), note(two, "y"), replace(note(one, "z"), level="warning")])
     assert text == "a.pkl\n  note     y\nb.pkl\n  error    x\n  warning  z\n1 error, 1 warning"
     assert render([]) == "0 errors, 0 warnings"

@@ -13,7 +13,7 @@ from neuspring.config import Config
 from neuspring.core.artifacts import Observations
 from neuspring.core.errors import InputError
 from neuspring.core.files import read_npz
-from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, TRACKS, Capture, write_tracks
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, REST, TRACKS, Capture, write_tracks
 from neuspring.intake.check import check_layout
 from neuspring.intake.points import Hands, held, observe, read, standing, write
 from neuspring.scenes.sources import SOURCES, scenario_rows
@@ -92,6 +92,21 @@ def test_a_node_at_an_annotated_point_is_left_out_and_nodes_below_the_table_are_
     seen = observed(capture)
     assert len(seen.surface_points) == len(nodes) - 1
     assert seen.surface_points[:, 2].min() == 0
+
+
+def test_the_unloaded_shape_follows_the_points_that_stay(capture):
+    nodes = scene.NODES.copy()
+    nodes[0] = scene.MARKED[0]
+    write(capture.folder, None, nodes)
+    rest = np.concatenate([scene.MARKED, nodes, scene.GRIP]) + 0.01 * np.arange(4 + len(nodes) + 4)[:, None]
+    np.savez(capture.folder / REST, points=rest)
+    seen = observed(capture)
+    # Point 3 is not seen in frame 0, and node 0 lies at point 0.
+    np.testing.assert_allclose(seen.rest_shape, np.delete(rest, [3, 4], axis=0), atol=TOLERANCE)
+    assert REST in seen.scenario.provenance
+    np.savez(capture.folder / REST, points=rest[1:])
+    with pytest.raises(InputError, match=r"rest\.npz.*the annotated points, the nodes and the controllers"):
+        read(capture)
 
 
 def test_up_may_be_minus_z(tmp_path):
@@ -275,7 +290,7 @@ def test_a_hand_must_hold_in_some_training_frame(capture):
 
 def test_nodes_that_meet_on_the_table_are_one():
     nodes = np.array([[0.0, 0, -0.02], [0, 0, -0.01], [0, 0, 0.01], [0.02, 0, -0.01]])
-    np.testing.assert_allclose(standing(nodes, 1.0), [[0, 0, 0], [0, 0, 0.01], [0.02, 0, 0]])
+    np.testing.assert_allclose(standing(nodes, 1.0)[0], [[0, 0, 0], [0, 0, 0.01], [0.02, 0, 0]])
 
 
 def test_a_film_and_points_alone_are_not_taken_for_each_other(capture, tmp_path):

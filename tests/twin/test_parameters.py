@@ -12,7 +12,6 @@ from neuspring.core.artifacts import Twin
 from neuspring.physics.parameters import pack, twin_tensors
 from neuspring.physics.solver import FrameSolver, simulate_frame
 from neuspring.twin.field import in_cube, midpoints
-from neuspring.twin.fit import TwinFit, fit
 from neuspring.twin.parameters import TwinParameters, inward_clamp, movement
 from tests.support import small
 from tests.support.scenes import random_scene, twin_of
@@ -232,15 +231,3 @@ def test_shares_count_springs_at_the_bound_and_at_the_range():
         trained.offsets[30:70] = 0.5  # above the range, not at the bound
     figures = movement(trained)
     assert figures == pytest.approx({"at_bound": 30 / count, "at_stiffness_range": 50 / count})
-
-
-def test_gradients_are_compared_with_epsilon():
-    still = {"epochs": 1, "learning_rate": 1e-12}
-    runs = [fit(small.fit_problem(fit=config.Fit(epsilon=epsilon, **still))) for epsilon in (1e-15, 1e-3)]
-    coarse, fine = (run.facts["gradient_over_epsilon"] for run in runs)
-    assert coarse == pytest.approx(1e12 * fine, rel=1e-2)
-    assert coarse > 1
-    run = TwinFit(small.fit_problem(kind="springs", fit=config.Fit(epochs=1, horizon=0)))
-    run.gradients = []
-    small.done(run.epoch())
-    assert run.gradients == [float(run.parameters.offsets.grad.abs().median())]

@@ -95,7 +95,7 @@ def require_equal(one: FitResult, other: FitResult):
     require_equal_twins(one.twin, other.twin)
     pd.testing.assert_frame_equal(one.history, other.history)
     assert (one.facts["best_epoch"], one.facts["rollout_loss"]) == (other.facts["best_epoch"], other.facts["rollout_loss"])
-    moved = ("at_bound", "at_stiffness_range", "factors", "gradient_over_epsilon")
+    moved = ("at_bound", "at_stiffness_range", "factors")
     assert [one.facts.get(name) for name in moved] == [other.facts.get(name) for name in moved]
 
 

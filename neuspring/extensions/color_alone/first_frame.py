@@ -155,7 +155,7 @@ def medial(
     median one.
     """
     centers, radii, _ = discs(filled)
-    rays = camera.lift(centers.astype(float), np.ones(len(centers))) - camera.camera_to_world[:3, 3]
+    rays = camera.rays(centers)
     # Per meter of depth.
     thick = 2 * factor * radii / camera.intrinsics[0, 0]
     thick = np.minimum(thick, widest * np.median(thick))
@@ -176,7 +176,7 @@ def medial(
 
 def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> np.ndarray:
     """Depth [n], m along the optical axis, at which the rays of pixels (x, y) [n, 2] meet the planes at z [n]; inf: never."""
-    rays = camera.lift(pixels.astype(float), np.ones(len(pixels))) - camera.camera_to_world[:3, 3]
+    rays = camera.rays(pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (z - camera.camera_to_world[2, 3]) / rays[:, 2]
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
@@ -188,7 +188,7 @@ def upright_depth(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     On the table where the camera looks down.
     """
     below, axis = camera_depth(camera, pixels, 0.0), camera.camera_to_world[:2, 2]
-    along = (camera.lift(pixels, np.ones(len(pixels))) - camera.camera_to_world[:3, 3])[:, :2] @ axis
+    along = camera.rays(pixels)[:, :2] @ axis
     if np.hypot(*axis) <= LEVEL_VIEW or along.min() <= 0:
         return below
     return np.asarray((below * along).min() / along)

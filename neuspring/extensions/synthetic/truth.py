@@ -101,7 +101,7 @@ def under_pixels(truth: Truth, camera: Camera, pixels: np.ndarray) -> MaterialPo
     Hands are not looked at: a pixel that shows a hand gets the object behind it. Choose pixels by the capture's masks.
     """
     origin = camera.camera_to_world[:3, 3]
-    rays = camera.lift(np.asarray(pixels, dtype=float), np.ones(len(pixels))) - origin
+    rays = camera.rays(pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return _ask(truth, first_hit, len(rays), wp.vec3(*origin), on_cpu(rays, wp.vec3))
 
