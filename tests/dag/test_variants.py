@@ -34,7 +34,7 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(proj
     assert set(transfers["scenario"]) == {SCENE}
     record = json.loads((results / SCENE / "neuspring" / "0" / "run.json").read_text())
     assert record["variant"]["clusters"] == 5
-    assert record["variant"]["field.plane_learning_rate"] == 0.01
+    assert record["variant"]["field.plane_learning_rate"] == 0.03
     # test_workflow runs the job that logs. Here the records are logged from this process, which saves a start for each.
     tracking.init(results, config.Tracking())
     assert {word: len(names) for word, names in tracking.sync(results, config.Tracking()).items()} == {"logged": 2}
