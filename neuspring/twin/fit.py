@@ -482,10 +482,13 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         "spring_updates": len(history) * frames * counts["springs"] * counts["substeps"],
         **counts,
     }
+    course = history.set_index("epoch")[["loss", "rollout_loss", "gradient_norm", "learning_rate"]]
+    # The rollout of the search's twin, before epoch 0.
+    course.loc[-1, "rollout_loss"] = facts["search_loss"]
     return FitResult(
         twin=best,
         history=history,
-        course=history.set_index("epoch")[["loss", "rollout_loss", "gradient_norm", "learning_rate"]],
+        course=course.sort_index(),
         facts=facts,
         attempts=loop.attempts,
         earlier_seconds=loop.earlier_seconds,
