@@ -147,7 +147,6 @@ class Buffers:
         self.indices: dict[str, torch.Tensor] = {}
         self.alike = False
         """True where all nodes of a twin have the same mass: impulses are then shared in halves."""
-        self.constants: dict[str, torch.Tensor] = {}
         self.history = self.substeps if differentiable else 1
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
         total = nodes + controllers

@@ -100,8 +100,6 @@ class Lines:
     """Region of each point [P]."""
     masses: np.ndarray
     """Mass of each point [P], kg; 0 where it has none."""
-    loose: int
-    """Number of nodes that no line carries."""
     points: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """From nodes [N, 3] and controllers [C, 3] to all points [P, 3], m."""
 
@@ -127,8 +125,6 @@ class Body(ABC):
     """Settings that its search reads beside those of every search."""
     by_gradients = False
     """Fits go epoch by epoch, with gradients: they share launches, and sweeps watch them."""
-    starts_anywhere = False
-    """Positions and velocities of the nodes are its whole state, so that it may start in any frame."""
     format: str
     """Name of the plain export's format."""
     about: str

@@ -58,7 +58,7 @@ ROLLOUT_EVERY = 5
 """Epochs between two rollouts. All fits that share launches make theirs together."""
 PLATEAU_EPOCHS = 40
 """Epochs without a better twin after which a fit has converged."""
-MOST_GROWTH = 8
+MOST_GROWTH = 3.0
 """Substeps at most, as a multiple of the search's: a few springs that stiffen without end would set the cost of all."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
@@ -121,11 +121,6 @@ class FitResult(Learned):
     """
 
     history: pd.DataFrame
-
-    @property
-    def best_epoch(self) -> int:
-        """Epoch whose end is the result; -1: the start."""
-        return int(self.facts["best_epoch"])
 
     @property
     def rollout_loss(self) -> float:
@@ -197,7 +192,7 @@ class FitRecording:
         self.rest: _Motion = (torch.tensor(graph.nodes, device=device), _tensor(velocity, device), None)
         self.safety = problem.simulation.safety
         may_grow = problem.simulation.substeps == "auto" and not problem.quirks.frame_time_667
-        self.most_substeps = min(MOST_GROWTH * twin.simulation.substeps, stability.MAX_SUBSTEPS) if may_grow else 0
+        self.most_substeps = stability.MAX_SUBSTEPS if may_grow else 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
         """The last spectrum that was computed, and for which stiffness and dashpots."""
 
@@ -220,7 +215,7 @@ class FitRecording:
         """The present parameters, packed, after checking that they can be integrated.
 
         Takes more substeps where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
-        MOST_GROWTH, `MAX_SUBSTEPS`) and the bound is passed.
+        `MAX_SUBSTEPS`) and the bound is passed.
         """
         packed = parameters.pack(self.twin.simulation.substep, self.start)
         springs = packed["springs"].detach().double().cpu().numpy()
@@ -296,6 +291,8 @@ class TwinFit:
         released, lengths = problem.quirks.frame_time_667, problem.simulation.rest_lengths
         others = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
         self.recordings = [FitRecording(problem, *one) for one in [(problem.observations, problem.twin), *others]]
+        if any(one.most_substeps for one in self.recordings):
+            self.parameters.growth = MOST_GROWTH
         self.trained = list(self.parameters.parameters())
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2

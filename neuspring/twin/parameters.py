@@ -3,7 +3,10 @@
 Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`).
 With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
-    Y = Y0 exp(b(o)), clamped to the stiffness range.
+    Y = Y0 exp(b(o)), clamped to the stiffness range, and to g^2 times its value in the search.
+
+Dashpots are clamped to g times their value there. With both the substeps that a twin needs grow at most g-fold, for its matrices
+of stiffness and damping grow at most as their fastest growing spring.
 
 Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
@@ -32,6 +35,8 @@ SPRING_FACTORS = ("stiffness", "dashpot")
 """Those that may have a factor of their own for controllers' springs."""
 UNTRAINED = ("contact_distance",)
 """It only selects pairs, so it has no gradient."""
+NO_BOUND = 1e3
+"""A growth that no fit reaches."""
 LOWEST_STIFFNESS = 1e-3
 """Stiffness below this is raised to it before taking the logarithm, N."""
 
@@ -40,19 +45,19 @@ class _InwardClamp(torch.autograd.Function):
     """Clamp whose gradient passes inside the limits, and at or beyond them if a descent step would lead back inside."""
 
     @staticmethod
-    def forward(ctx: Any, value: torch.Tensor, low: float, high: float) -> torch.Tensor:  # type: ignore[override]
-        ctx.save_for_backward(value)
-        ctx.limits = (low, high)
-        return value.clamp(low, high)
+    def forward(ctx: Any, value: torch.Tensor, low: float, high: float | torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        limits = [torch.as_tensor(limit, dtype=value.dtype, device=value.device) for limit in (low, high)]
+        ctx.save_for_backward(value, *limits)
+        return value.clamp(*limits)
 
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:  # type: ignore[override]
-        (value,), (low, high) = ctx.saved_tensors, ctx.limits
+        value, low, high = ctx.saved_tensors
         outward = ((value >= high) & (gradient < 0)) | ((value <= low) & (gradient > 0))
         return gradient.masked_fill(outward, 0.0), None, None
 
 
-def inward_clamp(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
+def inward_clamp(value: torch.Tensor, low: float, high: float | torch.Tensor) -> torch.Tensor:
     """`value` clamped to [low, high]; a value beyond a limit still feels gradients that pull it back."""
     result: torch.Tensor = _InwardClamp.apply(value, low, high)  # type: ignore[no-untyped-call]
     return result
@@ -94,6 +99,8 @@ class TwinParameters(nn.Module):
         self.to(device)
         self.first = self.copy()
         """The trained values before the first step."""
+        self.growth = NO_BOUND
+        """g of the head of this file."""
 
     def _factor_names(self) -> list[str]:
         """Common factors that are trained: what they scale, `controller_` before it where of those springs."""
@@ -139,10 +146,12 @@ class TwinParameters(nn.Module):
         stiffness = start["stiffness"] * (self.deviation() * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
-        values["stiffness"] = clamp(stiffness, *s.stiffness_range)
+        low, high = s.stiffness_range
+        values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.growth**2 * start["stiffness"]), low, high)
         for name in DAMPING_FACTORS:
             if name in self.factors:
                 values[name] = start[name] * self._common(name)
+        values["dashpot"] = inward_clamp(values["dashpot"], 0.0, self.growth * start["dashpot"])
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float, start: Mapping[str, torch.Tensor] | None = None) -> Parameters:

@@ -125,7 +125,6 @@ v_x, c v_y, -ground_elasticity v_z), c = max(0, 1 - ground_friction (1 + ground_
             about="edges, EI / l²",
             labels=np.full(points + len(rod.mass), topology.labels.min()),
             masses=np.concatenate([np.zeros(points), rod.mass]),
-            loose=0,
             points=lambda x, held: np.concatenate([x, held, at_vertices(rod, x, held)]),
         )
 

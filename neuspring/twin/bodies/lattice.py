@@ -27,7 +27,6 @@ class Lattice(Body):
     name = "lattice"
     fits = ("springs", "field")
     by_gradients = True
-    starts_anywhere = True
     format = "neuspring-plain"
     about = "A spring-mass twin: nodes that are joined by springs with dashpots"
     equations = """
@@ -114,7 +113,6 @@ and it goes on for the rest of dt.
         topology, mass = twin.topology, twin.material.mass
         nodes, hands = len(topology.nodes), len(topology.controllers)
         own = mass if len(mass) else np.ones(nodes, np.float32)
-        carried = np.unique(topology.springs[topology.springs < nodes])
         return Lines(
             pairs=topology.springs,
             rest_lengths=topology.rest_lengths,
@@ -124,7 +122,6 @@ and it goes on for the rest of dt.
             about="object springs",
             labels=np.pad(topology.labels, (0, hands), constant_values=topology.labels.min()),
             masses=np.concatenate([own, np.zeros(hands, np.float32)]),
-            loose=nodes - len(carried),
             points=lambda x, held: np.concatenate([x, held]),
         )
 

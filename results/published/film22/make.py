@@ -5,7 +5,8 @@
 DATA has phystwin22_films and phystwin_camera0. WORK gets captures and the results of config/data/film22.yaml; what is there stays,
 so a call that was cut off goes on. --only chooses what is run now, as the key `only` does; --cores 0 runs nothing. OUT gets
 summary.md with the tables, scores.csv with all numbers, and silhouettes.npz: what the row `BEST`, which was named beforehand,
-predicts. With z = np.load("silhouettes.npz") the object in frame z["CASE_frames"][k] of a seed is
+predicts. Scenes of an earlier call that WORK does not have stay in OUT. With z = np.load("silhouettes.npz") the object in frame
+z["CASE_frames"][k] of a seed is
 
     np.unpackbits(z["CASE"][seed, k]).reshape(362, 640)
 
@@ -315,10 +316,15 @@ def main() -> None:
             strip(scene, a.strips)
         print(case, flush=True)
     if a.output:
-        scores = pd.DataFrame(rows, columns=COLUMNS)
+        scores, table, masks = pd.DataFrame(rows, columns=COLUMNS), a.output / "scores.csv", a.output / "silhouettes.npz"
+        if table.exists():
+            before = pd.read_csv(table)
+            scores = pd.concat([before[~before["case"].isin(scores["case"])], scores], ignore_index=True)
+            with np.load(masks) as stored:
+                kept = dict(stored) | kept
         a.output.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(a.output / "silhouettes.npz", **kept)
-        write_text(a.output / "scores.csv", scores.to_csv(index=False, float_format="%.4f"))
+        np.savez_compressed(masks, **kept)
+        write_text(table, scores.to_csv(index=False, float_format="%.4f"))
         title = f"# The paper's 22 scenes on film, one color camera; `{BEST}` was named beforehand"
         lines = [title, *lines_of(scores), *hours(results), "\n## Notes\n", *(f"- {note}" for note in notes)]
         write_text(a.output / "summary.md", "\n".join(lines) + "\n")

@@ -179,7 +179,7 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
                 result = fit(problem)
             twin = result.twin
             record |= {
-                "best_epoch": result.best_epoch,
+                "best_epoch": result.facts["best_epoch"],
                 "rollbacks": result.facts["rollbacks"],
                 "losses": list(result.history["loss"]),
             }
