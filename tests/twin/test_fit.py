@@ -94,7 +94,6 @@ LIMITED = {"fit": config.Fit(epochs=4, learning_rate=0.3)}
 @pytest.mark.parametrize(
     ("changes", "killed_in", "most_substeps"),
     [(GROWING, 10, 2000), (EVERYTHING, 3, 2000), (LIMITED, 3, 70)],
-    ids=["growing", "everything", "limited"],
 )
 def test_a_killed_fit_continues_bit_for_bit(tmp_path, monkeypatch, changes, killed_in, most_substeps):
     monkeypatch.setattr("neuspring.core.checkpoint.CHECKPOINT_EVERY", 1)
@@ -295,7 +294,7 @@ def test_a_fit_ends_when_rollouts_have_stopped_falling(monkeypatch):
     monkeypatch.setattr(module, "ROLLOUT_EVERY", 2)
     monkeypatch.setattr(module, "PLATEAU_EPOCHS", 4)
     slow, learning, all_epochs = (
-        fit(small.fit_problem(fit=config.Fit(epochs=7, learning_rate=rate, plateau=plateau)))
+        fit(small.fit_problem(fit=config.Fit(epochs=7, learning_rate=rate, plateau=plateau, decay_epochs=2)))
         for rate, plateau in ((3e-2, 0.9), (3e-2, 0.01), (1e-7, 0.0))
     )
     assert [(one.facts["epochs"], one.facts["converged"]) for one in (slow, learning, all_epochs)] == [
@@ -303,6 +302,7 @@ def test_a_fit_ends_when_rollouts_have_stopped_falling(monkeypatch):
         (7, False),
         (7, False),
     ]
+    assert learning.history["learning_rate"][2] == pytest.approx(3e-2 / 2)
 
 
 # Learning rates -------------------------------------------------------------------------------------------------------
