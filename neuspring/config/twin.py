@@ -86,7 +86,7 @@ class Fit(SettingsSection):
     """Bound b of the change per spring: stiffness stays within exp(+-b) of the searched value, by b tanh(x / b).
     Common factors come on top. 0: no bound."""
     global_stiffness: bool = False
-    """Training of one common factor of all stiffnesses beside springs or field, without a bound."""
+    """Training of one common factor of all stiffnesses beside springs or field."""
     controller_factors: bool = False
     """Two common factors each of stiffness and dashpots: of object springs, and of controllers' springs."""
     stiffness_range: Range = (0.0, 1e5)

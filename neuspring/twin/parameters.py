@@ -8,7 +8,7 @@ With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 Dashpots are clamped to g times their value there. With both the substeps that a twin needs grow at most g-fold, for its matrices
 of stiffness and damping grow at most as their fastest growing spring.
 
-Beside them: four contact scalars, and common factors exp(.), without a bound, of stiffness (`global_stiffness`), drag and
+Beside them: four contact scalars, and common factors exp(.) of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
 """
 
