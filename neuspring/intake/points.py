@@ -122,8 +122,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     nodes, annotated = none[0] if nodes is None else nodes, none if annotated is None else annotated
     rest: Any = none[0]
     if hands is not None and (shape := folder / REST).exists():
-        known = annotated.shape[1], len(nodes), hands.points.shape[1]
-        rest = attempt(read_rest, shape, sum(known), description)
+        rest = attempt(read_rest, shape, annotated.shape[1] + len(nodes) + hands.points.shape[1], description)
         rest = none[0] if rest is None else rest
     # A hand may be anywhere while it holds nothing.
     held_at = none if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
