@@ -120,18 +120,19 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     nodes: Any = attempt(read_nodes, files["nodes"]) if files.get("nodes") else None
     annotated = attempt(capture.tracks, marked)
     nodes, annotated = none[0] if nodes is None else nodes, none if annotated is None else annotated
-    rest: Any = none[0]
-    if hands is not None and (shape := folder / REST).exists():
-        rest = attempt(read_rest, shape, annotated.shape[1] + len(nodes) + hands.points.shape[1], description)
-        rest = none[0] if rest is None else rest
     # A hand may be anywhere while it holds nothing.
     held_at = none if hands is None else np.where(hands.holds[..., None] if hands.holds.size else True, hands.points, np.nan)
-    space = InSpace(hands, nodes, annotated if description.tracks == "train" else none, annotated, rest)
     moving = [Moving(points, description.frame_rate) for points in (annotated, held_at)]
     for where, one, remedy in zip((marked, file), moving, UNSEEN_ROW, strict=True):
         findings += examine("moving", where, one, remedy) if one.given.size else []
     # An entry that is no position says nothing about unit and table.
     seen, places = (one.points for one in moving)
+    rest, shape = None, folder / REST
+    # Without hands, which are required then, nothing is known of the count.
+    if shape.exists() and (hands or description.cameras):
+        rest = attempt(read_rest, shape, seen.shape[1] + len(nodes) + places.shape[1], description)
+    taught = seen if description.tracks == "train" else none
+    space = InSpace(hands, nodes, taught, seen, none[0] if rest is None else rest)
     first = seen[0][np.isfinite(seen[0]).all(axis=1)]
     if description.tracks == "train" and len(first) < LEAST_NODES:
         rule = f"with tracks: train at least {LEAST_NODES} points must be annotated in frame 0, where the twin starts"
@@ -143,7 +144,7 @@ def look(capture: Capture, brought: Mapping[str, Path] | None = None) -> tuple[I
     if len(nodes) and not any(one.level == "error" for one in findings):
         findings += examine("points on nodes", marked, seen[0], nodes)
         findings += _holding(capture, space, places, first, file) if hands is not None and file is not None else []
-    return replace(space, tracks=seen if description.tracks == "train" else none, annotated=seen), findings
+    return space, findings
 
 
 def _holding(capture: Capture, space: InSpace, places: np.ndarray, first: np.ndarray, file: Path) -> list[Finding]:

@@ -291,7 +291,7 @@ class TwinFit:
         released, lengths = problem.quirks.frame_time_667, problem.simulation.rest_lengths
         others = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
         self.recordings = [FitRecording(problem, *one) for one in [(problem.observations, problem.twin), *others]]
-        if any(one.most_substeps for one in self.recordings):
+        if self.recordings[0].most_substeps:
             self.parameters.growth = MOST_GROWTH
         self.trained = list(self.parameters.parameters())
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
@@ -521,8 +521,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "rollout_loss": None, "gradient_norm": None}
     row["frames_left_out"] = 0
-    decay = problem.fit.decay_epochs
-    run.set_rate(state.rate / (1 + epoch / decay) if decay else state.rate)
+    run.set_rate(state.rate / (1 + epoch / (problem.fit.decay_epochs or math.inf)))
     row["learning_rate"] = run.optimizer.param_groups[0]["lr"]
     try:
         losses = yield from run.epoch()

@@ -35,8 +35,6 @@ SPRING_FACTORS = ("stiffness", "dashpot")
 """Those that may have a factor of their own for controllers' springs."""
 UNTRAINED = ("contact_distance",)
 """It only selects pairs, so it has no gradient."""
-NO_BOUND = 1e3
-"""A growth that no fit reaches."""
 LOWEST_STIFFNESS = 1e-3
 """Stiffness below this is raised to it before taking the logarithm, N."""
 
@@ -99,8 +97,8 @@ class TwinParameters(nn.Module):
         self.to(device)
         self.first = self.copy()
         """The trained values before the first step."""
-        self.growth = NO_BOUND
-        """g of the head of this file."""
+        self.growth = 1e3
+        """g of the head of this file; as it is here no fit reaches it."""
 
     def _factor_names(self) -> list[str]:
         """Common factors that are trained: what they scale, `controller_` before it where of those springs."""
@@ -146,8 +144,7 @@ class TwinParameters(nn.Module):
         stiffness = start["stiffness"] * (self.deviation() * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
-        low, high = s.stiffness_range
-        values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.growth**2 * start["stiffness"]), low, high)
+        values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.growth**2 * start["stiffness"]), *s.stiffness_range)
         for name in DAMPING_FACTORS:
             if name in self.factors:
                 values[name] = start[name] * self._common(name)

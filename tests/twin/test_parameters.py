@@ -155,8 +155,7 @@ def test_the_bound_of_stiffness():
     for sign, growth, most in ((-1.0, 1e3, np.exp(-1.5)), (1.0, 1e3, np.exp(1.5)), (1.0, 2.0, 4.0)):
         trained = offsets(parameters("springs", **ALL), sign * 50.0)
         trained.growth = growth
-        factor = torch.tensor(most, dtype=torch.float32)
-        torch.testing.assert_close(trained.physical()["stiffness"], trained.start["stiffness"] * factor, rtol=SINGLE, atol=0)
+        torch.testing.assert_close(trained.physical()["stiffness"], trained.start["stiffness"] * most, rtol=SINGLE, atol=0)
 
 
 def test_controllers_springs_may_have_factors_of_their_own():

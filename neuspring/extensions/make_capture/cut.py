@@ -10,7 +10,7 @@ import numpy as np
 
 from neuspring.core.errors import InputError
 from neuspring.core.records import digest_file
-from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, POINTS, TRACKS, Capture, Writer
+from neuspring.data.capture import CAPTURE, CONTROLLERS, NODES, POINTS, REST, TRACKS, Capture, Writer
 from neuspring.data.images import make_way
 from neuspring.intake import points
 
@@ -48,4 +48,6 @@ def cut(capture: Capture, first: int, last: int, folder: Path) -> Capture:
     if hands is not None:
         hands = replace(hands, points=hands.points[kept], holds=hands.holds[kept] if hands.holds.size else hands.holds)
     points.write(folder, hands, points.read_nodes(body) if body else np.zeros((0, 3)))
+    if (shape := capture.folder / REST).exists():
+        shutil.copyfile(shape, folder / REST)
     return writer.finish(tracks, marked, **source)

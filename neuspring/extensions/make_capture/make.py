@@ -40,7 +40,7 @@ FEW_FRAMES = 5
 """Frames of a camera in which the table or a board is looked for."""
 RATE_APART = 0.02
 """Stated frame rates may differ by this fraction from that of the stamps."""
-PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES)
+PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES, capture.REST)
 """Work of people and of hours, which --force does not remove."""
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuspring.core.errors import InputError
-from neuspring.data.capture import Capture
+from neuspring.data.capture import REST, Capture
 from neuspring.extensions.make_capture.cut import cut
 from neuspring.intake.points import read
 from tests.support import spaced as scene
@@ -39,8 +39,10 @@ def test_frames_that_make_no_capture_are_not_cut(tmp_path, first, last, message)
 
 def test_a_capture_is_cut_with_its_hands_and_nodes(tmp_path):
     original = spaced(tmp_path / "lifted")
+    np.savez(original.folder / REST, points=np.ones((56, 3)))
     part = cut(original, 0, 5, tmp_path / "part")
     np.testing.assert_allclose(read(part).hands.points, scene.risen(scene.GRIP, 6))
     assert len(read(part).nodes) == len(scene.NODES)
+    assert len(read(part).rest) == 56
     with pytest.raises(InputError, match=r"nodes\.npz.*frame 0.*a cut must begin; received frame 1"):
         cut(original, 1, 6, tmp_path / "later")
