@@ -9,6 +9,7 @@ springs. Lanes that no twin needs repeat the last one of their table.
 
 import copy
 import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -24,6 +25,9 @@ from neuspring.physics.parameters import PARAMETERS, Parameters
 UNFUSED = {"module": "unique", "enable_backward": False, "module_options": {"fuse_fp": False}}
 """Options of the kernels of a frame. A fused product and sum rounds once, and a GPU fuses where a CPU does not: contacts then flip
 on one of them alone."""
+
+BEHIND = 8
+"""Elements behind the end of an array that blocks read, and do not use (blocks.py)."""
 
 
 @functools.cache
@@ -207,7 +211,8 @@ class Buffers:
         kind = {"dtype": self.dtype, "device": self.device}
         if self.threads:
             return torch.zeros((*shape, self.groups, *entry), **kind)
-        return torch.zeros((self.groups, *shape, *entry), **kind).movedim(0, len(shape))
+        size = math.prod((self.groups, *shape, *entry))
+        return torch.zeros(size + 3 * BEHIND, **kind)[:size].view(self.groups, *shape, *entry).movedim(0, len(shape))
 
     def add_integers(self, **values: np.ndarray) -> None:
         """Add constant arrays of integers."""

@@ -18,7 +18,8 @@ import torch
 import warp as wp
 
 from neuspring.core.device import load
-from neuspring.physics.arrays import UNFUSED, Buffers, structs
+from neuspring.physics import blocks
+from neuspring.physics.arrays import BEHIND, UNFUSED, Buffers, structs
 from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
@@ -48,7 +49,6 @@ def allocate(b: Buffers) -> None:
     else:
         b.set_table("pair_rows", (b.groups, b.nodes + 1))
         b.add_numbers(lower=b.nodes)
-        b.set_table("closing", (b.groups, b.nodes))
         _make_room(b, FIRST_PAIRS * b.nodes)
     b.add_numbers(bits=1 << b.width)
     bits = (torch.arange(1 << b.width)[:, None] >> torch.arange(b.width)) & 1
@@ -71,8 +71,8 @@ def overflow(b: Buffers) -> torch.Tensor:
 
 
 def _make_room(b: Buffers, pairs: int) -> None:
-    for name in ("pair_other", "pair_lanes"):
-        b.set_table(name, (b.groups, pairs))
+    for name, numbers in {"pair_other": 1, "pair_lanes": 1, "closing": 2}.items():
+        b.set_table(name, (b.groups, numbers * (pairs + BEHIND)))
 
 
 def find_candidates(b: Buffers, reach: float) -> None:
@@ -216,7 +216,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         `lower` counts partners before a node: as rows ascend it is the rank, among the other's, of the node whose row is made.
         """
         g = wp.tid()
-        room = model.pair_other.shape[1]
+        room = model.pair_other.shape[1] - BEHIND
         distance = model.distance[g]
         capacity = real(model.capacity)
         first = wp.int32(0)
@@ -268,7 +268,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
 @functools.cache
 def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
-    """(collided, add_pairs, after_pairs, adjoint of collided, of add_pairs) for a scalar type, wp.float32 or wp.float64, and lanes.
+    """(collided, add_all_pairs, after_pairs, adjoint of collided, of add_all_pairs) for a scalar type, wp.float32 or wp.float64, and lanes.
 
     A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes.
     """
@@ -302,16 +302,6 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
         for q in range(width):
             meets[q] = wp.where(length[q] < distance[q] and closing[q] < -approach, own[q], zero)
         return meets
-
-    @wp.func
-    def closing_pairs(model: Model, state: State, slot: int, inner: int, i: int, g: int, x: Vector, v: Vector) -> int:
-        """Put the pairs of a row that come closer into `closing`; their number. A branch for each is guessed wrong too often."""
-        count = wp.int32(0)
-        for k in range(model.pair_rows[g, i], model.pair_rows[g, i + 1]):
-            j = plain(model.pair_other[g, plain(k)])
-            model.closing[g, plain(count)] = k
-            count = count + wp.where(closes(state.x[slot, j, g] - x, state.after[inner, j, g] - v), 1, 0)
-        return count
 
     @wp.func
     def part(model: Model, own: Number, other: Number) -> Number:
@@ -362,8 +352,8 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
         count = state.met[inner, i, g]
         distance = model.distance[g]
         light = model.inverse_mass[i, g]
-        for place in range(closing_pairs(model, state, slot, inner, i, g, x, v)):
-            k = plain(model.closing[g, plain(place)])
+        for place in range(model.pair_rows[g, i], model.pair_rows[g, i + 1]):
+            k = plain(place)
             j = plain(model.pair_other[g, k])
             offset = state.x[slot, j, g] - x
             relative = state.after[inner, j, g] - v
@@ -376,6 +366,12 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
             state.met[inner, j, g] = state.met[inner, j, g] + meets
         state.moving[inner, i, g] = total
         state.met[inner, i, g] = count
+
+    @wp.func
+    def add_all_pairs(model: Model, state: State, slot: int, inner: int, g: int):
+        """`add_pairs` of all nodes."""
+        for i in range(model.nodes):
+            add_pairs(model, state, slot, inner, i, g)
 
     @wp.func
     def after_pairs(state: State, inner: int, i: int, g: int) -> Vector:
@@ -443,8 +439,10 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu)."""
-        wp.atomic_add(adjoint.after, i, g, adjoint.moving[i, g])
+        """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu).
+
+        `adjoint.after` begins as `adjoint.moving`.
+        """
         if wp.max(state.met[step, i, g]) == zero:
             return
         x = state.x[step, i, g]
@@ -458,12 +456,18 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
     @wp.func
     def add_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
         """The same by one thread for all."""
-        wp.atomic_add(adjoint.after, i, g, adjoint.moving[i, g])
         if wp.max(state.met[step, i, g]) == zero:
             return
         own = mean_adjoint(state, adjoint, step, i, g)
-        for place in range(closing_pairs(model, state, step, step, i, g, state.x[step, i, g], state.after[step, i, g])):
-            k = plain(model.closing[g, plain(place)])
+        for place in range(model.pair_rows[g, i], model.pair_rows[g, i + 1]):
+            k = plain(place)
             add_adjoint(model, state, adjoint, step, i, g, plain(model.pair_other[g, k]), model.pair_lanes[g, k], own)
 
-    return collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint
+    @wp.func
+    def add_all_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, g: int):
+        for i in range(model.nodes):
+            add_pairs_adjoint(model, state, adjoint, step, i, g)
+
+    if width == 1:
+        _, _, add_all_pairs, add_all_pairs_adjoint = blocks.functions(real)
+    return collided, add_all_pairs, after_pairs, collided_adjoint, add_all_pairs_adjoint

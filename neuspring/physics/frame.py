@@ -47,7 +47,7 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
     moved, moved_adjoint = motion.position(real, width)
-    collided, add_pairs, after_pairs, collided_adjoint, add_pairs_adjoint = collision.functions(real, width)
+    collided, add_all_pairs, after_pairs, collided_adjoint, add_all_pairs_adjoint = collision.functions(real, width)
     add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width, pushes)
 
     @wp.func
@@ -121,8 +121,7 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
                 for i in range(model.nodes):
                     state.moving[inner, i, g] = Vector()
                     state.met[inner, i, g] = Number()
-                for i in range(model.nodes):  #     v' += mean impulse from the partners that are hit
-                    add_pairs(model, state, slot, inner, i, g)
+                add_all_pairs(model, state, slot, inner, g)  # v' += mean impulse from the partners that are hit
                 for i in range(model.nodes):
                     moving = after_pairs(state, inner, i, g)
                     state.moving[inner, i, g] = moving
@@ -137,9 +136,8 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
                 advance_adjoint(model, state, adjoint, step, i, g)
             if model.collide != 0:
                 for i in range(model.nodes):
-                    adjoint.after[i, g] = Vector()
-                for i in range(model.nodes):
-                    add_pairs_adjoint(model, state, adjoint, step, i, g)
+                    adjoint.after[i, g] = adjoint.moving[i, g]
+                add_all_pairs_adjoint(model, state, adjoint, step, g)
             for i in range(model.nodes):
                 update_adjoint(model, state, adjoint, step, i, g)
             for i in range(model.nodes):
@@ -155,7 +153,7 @@ def kernels(real: Any, width: int, pushes: bool = False) -> Kernels:
         if model.collide == 0:
             update_adjoint(model, state, adjoint, step, i, g)
         else:
-            adjoint.after[i, g] = Vector()
+            adjoint.after[i, g] = adjoint.moving[i, g]
 
     def substep(model: Model, state: State, step: int):
         i, g = wp.tid()

@@ -1,8 +1,8 @@
 """Numbers and 3-vectors of several twins at once: the lanes that every kernel of the simulator computes in.
 
 A `Number` holds one scalar of each of W twins, a `Vector` three rows of W: x, y, z. A processor's vector unit works on all lanes
-in one instruction, and every load is contiguous. W = 1 is a twin alone: the same kernels, the same sums in the same order, so
-that a twin's numbers do not depend on its company.
+in one instruction, and every load is contiguous. W = 1 is a twin alone: the same sums in the same order, so that a twin's numbers
+do not depend on its company.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -13,13 +13,15 @@ import warp as wp
 
 MIN_SPRING_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
-LANE_WIDTHS = (1, 4, 8)
-"""Lanes that kernels are made for. 16 were no faster per twin than 8 (results/published/bench/NOTES.md)."""
+LANES = 8
+"""Twins that share vector instructions. 16 were no faster per twin (results/published/bench/NOTES.md)."""
+ALONE = 2
+"""Up to so many twins are faster one by one, in blocks (blocks.py): one takes 0.42 of the time of eight in lanes."""
 
 
 def width_for(twins: int) -> int:
-    """The smallest width that holds `twins`, or the largest there is."""
-    return next((width for width in LANE_WIDTHS if width >= twins), LANE_WIDTHS[-1])
+    """Lanes for so many twins."""
+    return LANES if twins > ALONE else 1
 
 
 class Lanes(NamedTuple):

@@ -25,7 +25,7 @@ from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
-from neuspring.physics.lanes import LANE_WIDTHS
+from neuspring.physics.lanes import ALONE, LANES
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 from neuspring.physics.union import Union
 
@@ -183,8 +183,10 @@ class FrameSolver:
         """Copy the state of the other's twins there, or back."""
         count = other.buffers.twins
         for name in ("x", "v"):
-            own, others = (solver.buffers.tensors[name][..., :count] for solver in (self, other))
-            (own if back else others).copy_(others if back else own)
+            values = self.buffers.get_vectors(name, 0)
+            if back:
+                values[:count] = other.buffers.get_vectors(name, 0)
+            (self if back else other).buffers.set_vectors(name, values if back else values[:count], 0)
 
     def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
         """Take where controllers are at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
@@ -468,7 +470,7 @@ def solver_of(union: Union, simulations: Sequence[Simulation], **options: Any) -
 
 
 def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
-    """A solver without gradients of several twins; on a CPU the first, if they come slowest first, end frames in fewer lanes.
+    """A solver without gradients of several twins; on a CPU the first, if they come slowest first, end frames out of lanes.
 
     Lanes cost the same whoever still moves in them, and few candidates of a search need several times the substeps of the others.
     Twins of several scenes do not narrow.
@@ -489,9 +491,9 @@ def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
         return solver
 
     solver = narrowest = made(len(twins))
-    if device == "cpu" and len(twins) <= LANE_WIDTHS[-1] and counts == sorted(counts, reverse=True):
-        for width in reversed(LANE_WIDTHS):
-            if width < narrowest.buffers.width and counts[width] < WORTH_NARROWING * counts[0]:
-                wider, narrowest = narrowest, made(width)
+    if device == "cpu" and len(twins) <= LANES and counts == sorted(counts, reverse=True):
+        for count in range(min(ALONE, len(twins) - 1), 0, -1):
+            if counts[count] < WORTH_NARROWING * counts[0]:
+                wider, narrowest = narrowest, made(count)
                 wider.narrow(narrowest)
     return solver

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from neuspring.physics.arrays import Buffers, structs
+from neuspring.physics import blocks
+from neuspring.physics.arrays import BEHIND, Buffers, structs
 from neuspring.physics.lanes import lanes
 
 
@@ -37,7 +38,7 @@ def allocate(b: Buffers, tables: Sequence[np.ndarray]) -> None:
         ranks=np.argsort(order),  # Where each spring of the caller's list stands here [S].
         # First spring of each node's row [N + 1], and upper end of each spring, of all tables one after the other.
         rows=np.concatenate([first + start for (_, first, _), start in zip(rows, starts, strict=True)]),
-        partners=np.concatenate([upper for _, _, upper in rows]),
+        partners=np.concatenate([*(upper for _, _, upper in rows), np.zeros(BEHIND)]),
         # The same for links: the first of each node, their other ends, ascending within a node, and their springs in the table.
         links=np.concatenate([first + start for (first, _, _), start in zip(links, link_starts, strict=True)]),
         link_partners=np.concatenate([other for _, other, _ in links]),
@@ -228,4 +229,6 @@ def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, An
         adjoint.x[i, g] = adj_x
         adjoint.v[i, g] = adj_v
 
+    if width == 1:
+        add_row, add_row_adjoint, _, _ = blocks.functions(real)
     return add_row, add_row_adjoint, gathered, gathered_adjoint

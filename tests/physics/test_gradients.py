@@ -160,14 +160,14 @@ def test_only_gradients_keep_all_substeps_and_frames_do_not_add_to_buffers(threa
     for substeps in (10, 40):
         body, x, v, hands = random_scene(33, substeps=substeps)
         for differentiable in (True, False):
-            solver = solver_for([body] * 4, 2, dtype=torch.float32, differentiable=differentiable, threads=threads)
+            solver = solver_for([body] * 8, 2, dtype=torch.float32, differentiable=differentiable, threads=threads)
             sizes[substeps, differentiable] = before = solver.nbytes
-            state = [torch.tensor(values, dtype=torch.float32).expand(4, -1, -1) for values in (x, v, hands[0], hands[1])]
+            state = [torch.tensor(values, dtype=torch.float32).expand(8, -1, -1) for values in (x, v, hands[0], hands[1])]
             solver.forward(*solver.forward(*state), *state[2:])
             assert solver.nbytes == before
     assert sizes[40, False] == sizes[10, False]
     # Vectors of float32: x and v of all points, and velocities of nodes.
-    assert sizes[40, True] - sizes[10, True] == 4 * 30 * (2 * (body.nodes + 2) + body.nodes) * 12
+    assert sizes[40, True] - sizes[10, True] == 8 * 30 * (2 * (body.nodes + 2) + body.nodes) * 12
 
 
 def resting_gradient(substeps: int, limit: AdjointLimit | None) -> tuple[float, float]:

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse.linalg import eigsh
 
 from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError
@@ -139,19 +138,17 @@ def test_a_prediction_keeps_the_sign_of_a_damped_mode(load):
 
 def test_a_spectrum_that_does_not_converge_is_above_the_value(monkeypatch):
     twin, value = random_twin(0), stability.twin_spectrum(random_twin(0)).stiffness
-    monkeypatch.setattr(lanczos, "RESTARTS", 1)
+    monkeypatch.setattr(lanczos, "MOST", lanczos.STEPS)
     monkeypatch.setattr(stability, "TOLERANCE", -1.0)
     assert value < stability.twin_spectrum(twin).stiffness < 1.5 * value
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_spectrum_is_arpack_s(seed):
-    """Not only near it: the number of substeps of a candidate hangs on its last digits."""
+def test_a_spectrum_is_that_of_the_matrices(seed):
+    """Nearer than its tolerance: the error of an eigenvalue is that of its mode squared."""
     twin = random_twin(seed)
     for matrix, value in zip(matrices(twin), vars(stability.twin_spectrum(twin)).values(), strict=False):
-        start = np.random.default_rng(0).standard_normal(len(matrix))
-        wanted = eigsh(matrix, k=1, which="LA", tol=stability.TOLERANCE, v0=start, return_eigenvectors=False)
-        assert value == pytest.approx(wanted[0], rel=1e-12)
+        assert value == pytest.approx(np.linalg.eigvalsh(matrix)[-1], rel=1e-5)
 
 
 def test_masses_change_the_spectrum():
