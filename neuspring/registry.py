@@ -12,10 +12,11 @@ A member is an object, or text "module:name" that is imported when it is first a
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
+from pathlib import Path
 from pkgutil import iter_modules, resolve_name
 from typing import Any, Generic, TypeVar
 
@@ -32,7 +33,7 @@ class Registry(Mapping[str, T], Generic[T]):
     such name (a KeyError too, so that it is a mapping).
     """
 
-    def __init__(self, kind: str, own: Mapping[str, T | str], type: type | tuple[type, ...] = object) -> None:
+    def __init__(self, kind: str, own: Mapping[str, T | str], type: type | tuple[type, ...] | str = object) -> None:
         self.kind, self._own, self._type = kind, dict(own), type
         self._loaded: dict[str, T] = {}
 
@@ -71,8 +72,9 @@ class Registry(Mapping[str, T], Generic[T]):
             member = point.load()
         except Exception as error:
             raise InputError(where, "must be importable", f"{type(error).__name__}: {error}", remedy) from error
-        if not isinstance(member, self._type):
-            raise InputError(where, f"must be a {getattr(self._type, '__name__', self._type)}", type(member).__name__, remedy)
+        kind = resolve_name(self._type) if isinstance(self._type, str) else self._type
+        if not isinstance(member, kind):
+            raise InputError(where, f"must be a {getattr(kind, '__name__', kind)}", type(member).__name__, remedy)
         return member
 
     def __iter__(self) -> Iterator[str]:
@@ -86,9 +88,21 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def module_of(self, name: str) -> str:
         """The module that a member is declared in, for digests of code; that of the registry's user for one given as an object."""
+        return self._place(name)[0]
+
+    def about(self, name: str) -> str:
+        """The first sentence of the docstring of a function, from its source: to import the functions of all names takes seconds."""
+        module, member = self._place(name)
+        source = _source(module).read_text(encoding="utf-8")
+        found = re.search(rf'^def {member}\(.*?"""(.+?)([.:;] |\.?$|\.?""")', source, re.DOTALL | re.MULTILINE)
+        return found[1] if found else ""
+
+    def _place(self, name: str) -> tuple[str, str]:
+        """The module and the member's name there; empty for an object."""
         own = self._own.get(name)
         text = own if isinstance(own, str) else self._foreign[name].value if name in self._foreign else ""
-        return text.partition(":")[0]
+        module, _, member = text.partition(":")
+        return module, member
 
 
 class Unknown(InputError, KeyError):
@@ -111,7 +125,10 @@ def _package(point: EntryPoint) -> str:
 def _left_out(point: EntryPoint) -> bool:
     """One of our own extensions whose folder was removed: that is how a user leaves it out."""
     module = point.value.partition(":")[0]
-    try:
-        return module.split(".")[0] == OURS and find_spec(module) is None
-    except ModuleNotFoundError:
-        return True
+    return module.split(".")[0] == OURS and not _source(module).exists()
+
+
+def _source(module: str) -> Path:
+    """The file of a module, which is not imported; its package is."""
+    top, *parts = module.split(".")
+    return Path(str(import_module(top).__file__)).parent.joinpath(*parts).with_suffix(".py")

@@ -11,7 +11,6 @@ import argparse
 import difflib
 import errno
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -97,16 +96,10 @@ def _run(words: list[str]) -> int:
     raise InputError("command", "must be a stage or a tool", command, remedy)
 
 
-def about(function: Callable[..., object]) -> str:
-    """The first sentence of a command's docstring, for the overview."""
-    return re.split(r"[.;] |\.$", (function.__doc__ or "").partition("\n")[0])[0].rstrip(".")
-
-
 def _overview() -> str:
     from neuspring.stages import STAGES
 
-    stages = [f"  {name:<17} {stage.about}" for name, stage in STAGES.items()]
-    tools = [f"  {name.replace('.', ' '):<17} {about(function)}" for name, function in COMMANDS.items()]
+    stages, tools = ([f"  {name.replace('.', ' '):<17} {each.about(name)}" for name in each] for each in (STAGES, COMMANDS))
     head = (
         "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n\nSpring-mass twins of deformable objects from RGBD video."
     )

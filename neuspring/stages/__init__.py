@@ -7,9 +7,12 @@ group `neuspring.stages`; the workflow and the command line ask the declarations
 
 from __future__ import annotations
 
-from neuspring.core.run_folder import LEARNING_STAGES
+from typing import TYPE_CHECKING
+
 from neuspring.registry import Registry
-from neuspring.stages.stage import Stage
+
+if TYPE_CHECKING:
+    from neuspring.stages.stage import Stage
 
 LEARNED = "learned"
 """The input that is the record of whatever learned the run's model."""
@@ -18,12 +21,14 @@ FLOW = """
     search fit appearance train
     rollout predict average render score transfer
 """
-STAGES: Registry[Stage] = Registry("stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, Stage)
+STAGES: Registry[Stage] = Registry("stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, f"{__name__}.stage:Stage")
 """In the order in which they read from each other."""
 
 
 def makers(name: str) -> list[Stage]:
     """The stages whose product is an input of this name; those that learn a model, the last one first, for `learned`."""
+    from neuspring.core.run_folder import LEARNING_STAGES
+
     if name == LEARNED:
         return [STAGES[learning] for learning in reversed(LEARNING_STAGES)]
     return [one for one in STAGES.values() if one.product == name]
