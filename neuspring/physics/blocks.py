@@ -83,9 +83,8 @@ _SPRINGS = """
         auto own = [=](int k) { return block + k; };
         Columns offset = columns(x, upper) - xi, relative = columns(v, upper) - vi, p = columns(springs, own);
         wide length = norm(offset);
-        wide side = p.y < zero ? wide(-one) : wide(one), acts = length * p.y < -one ? wide(zero) : wide(one);
-        p = {p.x * acts, p.y * side, p.z * acts};
-        wide strain = length * p.y - one;
+        wide side = p.y < zero ? wide(-one) : wide(one), shorter = p.y * side, strain = length * shorter - one;
+        wide acts = p.y < zero && strain > zero ? wide(zero) : wide(one);
 """
 _FORCES = f"""
     {_ROW}
@@ -95,7 +94,7 @@ _FORCES = f"""
 """ + """
         Columns d = offset / at_least(length, shortest);
         point f[8];
-        points(d * (p.x * strain + p.z * dot(relative, d)), f);
+        points(d * ((p.x * strain + p.z * dot(relative, d)) * acts), f);
         for (int k = 0; k < size(count, block); ++k) {
             real* to = force + 3 * upper(k);
             total += f[k];
@@ -113,15 +112,15 @@ _FORCES_ADJOINT = f"""
     point total_x = load(hx + 3 * i), total_v = load(hv + 3 * i);
     {_SPRINGS}
 """ + """
-        Columns c = hi - columns(force, upper);
+        Columns c = (hi - columns(force, upper)) * acts;
         wide inverse = one / at_least(length, shortest);
         wide cd = dot(c, offset) * inverse, wd = dot(relative, offset) * inverse;
         wide turned = (p.x * strain + p.z * wd) * inverse, drift = cd * p.z * inverse;
-        wide along = cd * (p.x * p.y - turned) - wd * drift;
+        wide along = cd * (p.x * shorter - turned) - wd * drift;
         point to_x[8], to_v[8], to_p[8];
         points(c * turned + relative * drift + offset * (along * inverse), to_x);
         points(offset * drift, to_v);
-        points({strain * cd * acts, length * cd * (acts * side), wd * cd * acts}, to_p);
+        points({strain * cd, length * side * cd, wd * cd}, to_p);
         for (int k = 0; k < size(count, block); ++k) {
             int j = 3 * upper(k), e = 3 * own(k);
             total_x -= to_x[k];

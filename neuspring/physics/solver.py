@@ -91,9 +91,7 @@ class FrameSolver:
         self.buffers.add_parameters(max(map(len, each)))
         springs.allocate(self.buffers, each)
         collision.allocate(self.buffers)
-        self._pushes = False
-        """True where some spring only pushes."""
-        self._choose_kernels()
+        self._kernels, self._graphs = frame.kernels(self.buffers.real, self.buffers.width), Graphs(device)
         self.grips = ControllerSprings(each[0], nodes, device) if len(each) == 1 else None
         self._held: torch.Tensor | None = None
         """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
@@ -116,16 +114,9 @@ class FrameSolver:
         """Memory of the buffers, bytes."""
         return sum(tensor.nbytes for tensor in (*self.buffers.tensors.values(), *self.buffers.indices.values()))
 
-    def _choose_kernels(self) -> None:
-        self._kernels = frame.kernels(self.buffers.real, self.buffers.width, self._pushes)
-        self._graphs = Graphs(self.device)
-
     def set_parameters(self, parameters: Parameters) -> None:
         """Copy packed parameters into the solver's buffers."""
         values = {name: self._stacked(parameters[name]) for name in PARAMETERS}
-        if (pushes := bool((values["springs"][..., 1] < 0).any())) != self._pushes:
-            self._pushes = pushes
-            self._choose_kernels()
         for name, value in values.items():
             self.buffers.set_parameter(name, value)
         self._plain, self._factor, self._held = values["springs"].detach(), None, None

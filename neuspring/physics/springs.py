@@ -71,88 +71,54 @@ def _links(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 @functools.cache
-def functions(real: Any, width: int, pushes: bool = False) -> tuple[Any, Any, Any, Any]:
-    """(add_row, its adjoint, gathered, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes.
-
-    `pushes`: some springs only push. To look at that in every spring costs a fifth of the time in lanes, with gradients a half.
-    """
+def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
+    """(add_row, its adjoint, gathered, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
     lane = lanes(real, width)
     Number, Vector = lane.Number, lane.Vector
     Model, State, Adjoint = structs(real, width)
     dot, scaled, root, divided, floored = lane.dot, lane.scaled, lane.root, lane.divided, lane.floored
     plain = lane.plain
     one = Number(*[real(1.0)] * width)
+    half = Number(*[real(0.5)] * width)
 
     @wp.func
-    def force(offset: Vector, relative: Vector, p: Vector) -> Vector:
-        """The force on the first end. Rows of the parameters p: Y, 1 / l0, gamma."""
-        length = root(dot(offset, offset))
-        d = divided(offset, floored(length))
-        strain = wp.cw_mul(length, p[1]) - one
-        return scaled(d, wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], dot(relative, d)))
-
-    @wp.func
-    def force_adjoint(offset: Vector, relative: Vector, p: Vector, c: Vector):
-        """Adjoints of c . f: of offset, of relative velocity, of p (second row over Y)."""
-        # With d = offset / l written out, so that d itself is never formed.
-        length = root(dot(offset, offset))
-        inverse = wp.cw_div(one, floored(length))
-        cd = wp.cw_mul(dot(c, offset), inverse)
-        wd = wp.cw_mul(dot(relative, offset), inverse)
-        strain = wp.cw_mul(length, p[1]) - one
-        # d(f.c)/d(offset): the direction turns (c and the relative velocity, without their parts along d), the length
-        # stretches the spring (along d).
-        turn = wp.cw_mul(wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], wd), inverse)
-        drift = wp.cw_mul(wp.cw_mul(cd, p[2]), inverse)
-        along = wp.cw_mul(cd, wp.cw_mul(p[0], p[1]) - turn) - wp.cw_mul(wd, drift)
-        adj_offset = scaled(c, turn) + scaled(relative, drift) + scaled(offset, wp.cw_mul(along, inverse))
-        return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, length, wd), cd)
-
-    @wp.func
-    def sides(p: Vector) -> Number:
-        """-1 for a spring that only pushes, 1 for others."""
-        side = Number()
-        for q in range(width):
-            side[q] = wp.where(p[1, q] < real(0.0), real(-1.0), real(1.0))
-        return side
-
-    @wp.func
-    def acts(offset: Vector, p: Vector) -> Number:
+    def acts(strain: Number, p: Vector) -> Number:
         """0 for a spring that only pushes and is longer than at rest, 1 for others."""
-        ratio = wp.cw_mul(root(dot(offset, offset)), p[1])
-        act = Number()
-        for q in range(width):
-            act[q] = wp.where(ratio[q] < real(-1.0), real(0.0), real(1.0))
-        return act
+        return wp.cw_mul(half, one + wp.sign(-wp.min(strain, -p[1])))
 
-    @wp.func
-    def acting(p: Vector, act: Number, side: Number) -> Vector:
-        """The parameters with what does not act taken out."""
-        return wp.matrix_from_rows(wp.cw_mul(p[0], act), wp.cw_mul(p[1], side), wp.cw_mul(p[2], act))
-
-    # Without springs that only push, Warp leaves out what `pushes` decides.
     @wp.func
     def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
         """The force of spring e on an end at x with velocity v, from its other end j."""
         offset = state.x[slot, j, g] - x
-        p = model.springs[e, g]
-        if pushes:  # noqa: SIM102
-            if j >= model.nodes:
-                p = acting(p, acts(offset, p), sides(p))
-        return force(offset, state.v[slot, j, g] - v, p)
+        relative = state.v[slot, j, g] - v
+        p = model.springs[e, g]  # Rows: Y, 1 / l0, gamma.
+        length = root(dot(offset, offset))
+        d = divided(offset, floored(length))
+        strain = wp.cw_mul(length, wp.abs(p[1])) - one
+        size = wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], dot(relative, d))
+        return scaled(d, wp.cw_mul(size, acts(strain, p)))
 
     @wp.func
-    def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, c: Vector):
+    def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, adj_force: Vector):
+        """Adjoints of offset, of relative velocity, of the parameters (second row over Y)."""
         offset = state.x[slot, j, g] - x
         relative = state.v[slot, j, g] - v
         p = model.springs[e, g]
-        if pushes:  # noqa: SIM102
-            if j >= model.nodes:
-                act = acts(offset, p)
-                side = sides(p)
-                adj_offset, adj_relative, adj_p = force_adjoint(offset, relative, acting(p, act, side), c)
-                return adj_offset, adj_relative, acting(adj_p, act, wp.cw_mul(act, side))
-        return force_adjoint(offset, relative, p, c)
+        # With d = offset / l written out, so that d itself is never formed.
+        length = root(dot(offset, offset))
+        inverse = wp.cw_div(one, floored(length))
+        shorter = wp.abs(p[1])
+        strain = wp.cw_mul(length, shorter) - one
+        c = scaled(adj_force, acts(strain, p))
+        cd = wp.cw_mul(dot(c, offset), inverse)
+        wd = wp.cw_mul(dot(relative, offset), inverse)
+        # d(f.c)/d(offset): the direction turns (c and the relative velocity, without their parts along d), the length
+        # stretches the spring (along d).
+        turn = wp.cw_mul(wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], wd), inverse)
+        drift = wp.cw_mul(wp.cw_mul(cd, p[2]), inverse)
+        along = wp.cw_mul(cd, wp.cw_mul(p[0], shorter) - turn) - wp.cw_mul(wd, drift)
+        adj_offset = scaled(c, turn) + scaled(relative, drift) + scaled(offset, wp.cw_mul(along, inverse))
+        return adj_offset, scaled(offset, drift), scaled(wp.matrix_from_rows(strain, wp.cw_mul(length, wp.sign(p[1])), wd), cd)
 
     @wp.func
     def add_row(model: Model, state: State, slot: int, i: int, g: int):
