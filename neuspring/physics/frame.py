@@ -39,15 +39,15 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def kernels(real: Any, width: int) -> Kernels:
-    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes."""
+def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
+    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; with springs that only push, or without any."""
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
     move_controller, updated, updated_adjoint = motion.velocity(real, width)
     moved, moved_adjoint = motion.position(real, width)
     collided, add_all_pairs, after_pairs, collided_adjoint, add_all_pairs_adjoint = collision.functions(real, width)
-    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width)
+    add_row, add_row_adjoint, gathered, gathered_adjoint = springs.functions(real, width, pushes)
 
     @wp.func
     def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):

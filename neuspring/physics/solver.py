@@ -117,6 +117,9 @@ class FrameSolver:
     def set_parameters(self, parameters: Parameters) -> None:
         """Copy packed parameters into the solver's buffers."""
         values = {name: self._stacked(parameters[name]) for name in PARAMETERS}
+        if self.buffers.width > 1:
+            pushes = bool((values["springs"][..., 1] < 0).any())
+            self._kernels = frame.kernels(self.buffers.real, self.buffers.width, pushes)
         for name, value in values.items():
             self.buffers.set_parameter(name, value)
         self._plain, self._factor, self._held = values["springs"].detach(), None, None

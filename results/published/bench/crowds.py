@@ -147,7 +147,7 @@ def warm(device: str) -> None:
     """Compile what a search runs, which depends on the widths of its groups."""
     widths = (1,) if device != "cpu" else (1, LANES)
     for width in widths:
-        made = frame.kernels(wp.float32, width)
+        made = frame.kernels(wp.float32, width, width == 1)
         its = [made.begin, made.substep] if device != "cpu" else [made.forward]
         for kernel in (*its, *trials.kernels(width)):
             load(kernel, device)

@@ -262,12 +262,14 @@ def lines_of(scores: pd.DataFrame) -> Iterator[str]:
 
 def hours(results: Path) -> Iterator[str]:
     """Hours of all finished jobs, which have a core each, by rule."""
-    spent: dict[str, list[float]] = {}
+    # Members of a batch have a log in common, and each the time of all.
+    spent: dict[str, dict[str, float]] = {}
     for record in read_jobs(results, damaged=[]):
         if not record.failed:
-            spent.setdefault(record.rule, []).append(record.seconds / 3600)
-    rows = [[rule, str(len(own)), f"{sum(own):.2f}"] for rule, own in sorted(spent.items(), key=lambda item: -sum(item[1]))]
-    rows.append(["all", str(sum(map(len, spent.values()))), f"{sum(map(sum, spent.values())):.2f}"])
+            spent.setdefault(record.rule, {})[record.log] = record.seconds / 3600
+    each = {rule: list(own.values()) for rule, own in spent.items()}
+    rows = [[rule, str(len(own)), f"{sum(own):.2f}"] for rule, own in sorted(each.items(), key=lambda item: -sum(item[1]))]
+    rows.append(["all", str(sum(map(len, each.values()))), f"{sum(map(sum, each.values())):.2f}"])
     yield from ("\n## Hours of jobs, on a core each\n", *Table.of_texts(["rule", "jobs", "hours"], rows).markdown())
 
 
@@ -303,7 +305,7 @@ def main() -> None:
     if a.cores:
         write_captures(films, captures, cases_of(films))
         command = [sys.executable, "-m", "snakemake", "--profile", "workflow/profiles/default", "--quiet", "rules"]
-        command += ["--until", "run", "--cores", str(a.cores), "--configfile", str(CONFIG)]
+        command += ["--cores", str(a.cores), "--configfile", str(CONFIG)]
         values = {"data_root": captures.resolve(), "results": results.resolve()} | ({"only": a.only} if a.only else {})
         subprocess.run([*command, "--config", *(f"{key}={value}" for key, value in values.items())], cwd=ROOT, check=True)
     methods, kept, notes, rows = read_yaml(CONFIG)["methods"], dict[str, np.ndarray](), list[str](), list[tuple[object, ...]]()
