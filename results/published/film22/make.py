@@ -240,6 +240,8 @@ def lines_of(scores: pd.DataFrame) -> Iterator[str]:
         new = table.index.isin(NEW)
         for name, chosen in {"all": new | True, "new": new, "known": ~new}.items():
             own = table[chosen].dropna()
+            if not len(own):
+                continue
             ends = [spread(scores, method, part, list(own.index)) for method in table]
             told = ["" if np.isnan(end) else f" ± {end:.3f}" for end in ends]
             rows.append([f"mean, {name} ({len(own)})", *(f"{m:.3f}{e}" for m, e in zip(own.mean(), told, strict=True))])
@@ -267,9 +269,9 @@ def hours(results: Path) -> Iterator[str]:
     for record in read_jobs(results, damaged=[]):
         if not record.failed:
             spent.setdefault(record.rule, {})[record.log] = record.seconds / 3600
-    each = {rule: list(own.values()) for rule, own in spent.items()}
-    rows = [[rule, str(len(own)), f"{sum(own):.2f}"] for rule, own in sorted(each.items(), key=lambda item: -sum(item[1]))]
-    rows.append(["all", str(sum(map(len, each.values()))), f"{sum(map(sum, each.values())):.2f}"])
+    sums = {rule: (len(own), sum(own.values())) for rule, own in spent.items()}
+    sums = dict(sorted(sums.items(), key=lambda item: -item[1][1])) | {"all": tuple(map(sum, zip(*sums.values(), strict=True)))}
+    rows = [[rule, str(jobs), f"{total:.2f}"] for rule, (jobs, total) in sums.items()]
     yield from ("\n## Hours of jobs, on a core each\n", *Table.of_texts(["rule", "jobs", "hours"], rows).markdown())
 
 
