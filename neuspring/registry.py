@@ -91,7 +91,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return self._place(name)[0]
 
     def about(self, name: str) -> str:
-        """The first sentence of the docstring of a function, from its source: to import the functions of all names takes seconds."""
+        """The first sentence of the docstring of a function, from its source: importing all functions takes seconds."""
         module, member = self._place(name)
         source = _source(module).read_text(encoding="utf-8")
         found = re.search(rf'^def {member}\(.*?"""(.+?)([.:;] |\.?$|\.?""")', source, re.DOTALL | re.MULTILINE)

@@ -86,12 +86,14 @@ _SPRINGS = """
         wide side = p.y < zero ? wide(-one) : wide(one), shorter = p.y * side, strain = length * shorter - one;
         wide acts = p.y < zero && strain > zero ? wide(zero) : wide(one);
 """
-_FORCES = f"""
-    {_ROW}
+_FORCES = (
+    _ROW
+    + """
     real* force = (real*)wp::address(state.force, 0, g);
     point total = load(force + 3 * i);
-    {_SPRINGS}
-""" + """
+"""
+    + _SPRINGS
+    + """
         Columns d = offset / at_least(length, shortest);
         point f[8];
         points(d * ((p.x * strain + p.z * dot(relative, d)) * acts), f);
@@ -103,15 +105,18 @@ _FORCES = f"""
     }
     store(force + 3 * i, total);
 """
-_FORCES_ADJOINT = f"""
-    {_ROW}
+)
+_FORCES_ADJOINT = (
+    _ROW
+    + """
     const real* force = (const real*)wp::address(adjoint.force, turn, 0, g);
     real *hx = (real*)wp::address(adjoint.x, 0, g), *hv = (real*)wp::address(adjoint.v, 0, g);
     real* hp = (real*)wp::address(adjoint.springs, spring, g);
     const Columns hi = all(load(force + 3 * i));
     point total_x = load(hx + 3 * i), total_v = load(hv + 3 * i);
-    {_SPRINGS}
-""" + """
+"""
+    + _SPRINGS
+    + """
         Columns c = (hi - columns(force, upper)) * acts;
         wide inverse = one / at_least(length, shortest);
         wide cd = dot(c, offset) * inverse, wd = dot(relative, offset) * inverse;
@@ -133,6 +138,7 @@ _FORCES_ADJOINT = f"""
     store(hx + 3 * i, total_x);
     store(hv + 3 * i, total_v);
 """
+)
 # First the pairs that come closer, with both of their nodes: a branch for each is guessed wrong too often.
 _PAIRS = """
     const real* x = (const real*)wp::address(state.x, slot, 0, g);
@@ -164,9 +170,12 @@ _PAIRS = """
             back = other / (other + own);
         }
 """
-_IMPULSES = """
+_IMPULSES = (
+    """
     real *moving = (real*)wp::address(state.moving, inner, 0, g), *met = (real*)wp::address(state.met, inner, 0, g);
-""" + _PAIRS + """
+"""
+    + _PAIRS
+    + """
         Columns n = offset / at_least(length, slowest);
         wide s = dot(u, n);
         Columns ut = u - n * s;
@@ -184,12 +193,16 @@ _IMPULSES = """
         }
     }
 """
-_IMPULSES_ADJOINT = """
+)
+_IMPULSES_ADJOINT = (
+    """
     const int slot = step, inner = step;
     real *hx = (real*)wp::address(adjoint.x, 0, g), *hv = (real*)wp::address(adjoint.after, 0, g);
     real *to_e = (real*)wp::address(adjoint.contact_e, 0, g), *to_mu = (real*)wp::address(adjoint.contact_mu, 0, g);
     const real *moving = (const real*)wp::address(adjoint.moving, 0, g), *met = (const real*)wp::address(state.met, step, 0, g);
-""" + _PAIRS + """
+"""
+    + _PAIRS
+    + """
         Columns own = columns(moving, lower) / at_least(numbers(met, lower), one);
         Columns other = columns(moving, upper) / at_least(numbers(met, upper), one);
         Columns h = (other * back - own * part) * meets;
@@ -221,6 +234,7 @@ _IMPULSES_ADJOINT = """
         }
     }
 """
+)
 
 
 @functools.cache

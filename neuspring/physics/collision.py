@@ -268,7 +268,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
 @functools.cache
 def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
-    """(collided, add_all_pairs, after_pairs, adjoint of collided, of add_all_pairs) for a scalar type, wp.float32 or wp.float64, and lanes.
+    """(collided, add_all_pairs, after_pairs, adjoints of the first two) for a scalar type, wp.float32 or wp.float64, and lanes.
 
     A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes.
     """

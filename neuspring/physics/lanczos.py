@@ -37,7 +37,7 @@ def largest(
     views: list[Any] = [wp.array(one, dtype=kind, copy=False, device="cpu") for one, kind in zip(numbers, kinds, strict=True)]
 
     def found(weights: np.ndarray) -> tuple[float, int]:
-        of_springs = wp.array(weights, dtype=wp.float64, copy=False, device="cpu")
+        of_springs: Any = wp.array(weights, dtype=wp.float64, copy=False, device="cpu")
         basis[0, moves] = np.random.default_rng(0).standard_normal((moves.sum(), 3))
         basis[0] /= max(np.linalg.norm(basis[0]), np.finfo(float).tiny)
         for size in range(STEPS, MOST + 1, STEPS):

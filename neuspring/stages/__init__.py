@@ -21,7 +21,9 @@ FLOW = """
     search fit appearance train
     rollout predict average render score transfer
 """
-STAGES: Registry[Stage] = Registry("stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, f"{__name__}.stage:Stage")
+STAGES: Registry[Stage] = Registry(
+    "stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, "neuspring.stages.stage:Stage"
+)
 """In the order in which they read from each other."""
 
 
