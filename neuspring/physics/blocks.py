@@ -17,7 +17,11 @@ from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import MIN_SPRING_LENGTH
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
+# A GPU, where a thread has a node, never comes here.
 _COLUMNS = """
+#ifdef __CUDA_ARCH__
+    __trap();
+#else
     typedef %s real;
     typedef real wide __attribute__((ext_vector_type(8)));
     typedef real point __attribute__((ext_vector_type(4)));  // x, y, z, and a number that means nothing
@@ -235,6 +239,9 @@ _IMPULSES_ADJOINT = (
     }
 """
 )
+_END = """
+#endif
+"""
 
 
 @functools.cache
@@ -245,16 +252,16 @@ def functions(real: Any) -> tuple[Any, Any, Any, Any]:
     Model, State, Adjoint = structs(real, 1)
     head = _COLUMNS % ("float" if real == wp.float32 else "double", MIN_SPRING_LENGTH, APPROACH, MIN_TANGENT)
 
-    @wp.func_native(head + _FORCES)
+    @wp.func_native(head + _FORCES + _END)
     def add_row(model: Model, state: State, slot: int, i: int, g: int): ...
 
-    @wp.func_native(head + _FORCES_ADJOINT)
+    @wp.func_native(head + _FORCES_ADJOINT + _END)
     def add_row_adjoint(model: Model, state: State, adjoint: Adjoint, slot: int, turn: int, i: int, g: int): ...
 
-    @wp.func_native(head + _IMPULSES)
+    @wp.func_native(head + _IMPULSES + _END)
     def add_all_pairs(model: Model, state: State, slot: int, inner: int, g: int): ...
 
-    @wp.func_native(head + _IMPULSES_ADJOINT)
+    @wp.func_native(head + _IMPULSES_ADJOINT + _END)
     def add_all_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, g: int): ...
 
     return add_row, add_row_adjoint, add_all_pairs, add_all_pairs_adjoint
