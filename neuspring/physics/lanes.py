@@ -13,7 +13,7 @@ import warp as wp
 
 MIN_SPRING_LENGTH = 1e-6
 """Lengths are floored here when a direction is formed, m."""
-LANES = 8
+LANE_WIDTH = 8
 """Twins that share vector instructions. 16 were no faster per twin (results/published/bench/NOTES.md)."""
 ALONE = 2
 """Up to so many twins are faster one by one, in blocks (blocks.py): one takes 0.42 of the time of eight in lanes."""
@@ -21,7 +21,7 @@ ALONE = 2
 
 def width_for(twins: int) -> int:
     """Lanes for so many twins."""
-    return LANES if twins > ALONE else 1
+    return LANE_WIDTH if twins > ALONE else 1
 
 
 class Lanes(NamedTuple):

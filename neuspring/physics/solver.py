@@ -25,7 +25,7 @@ from neuspring.core.errors import InputError
 from neuspring.physics import collision, frame, springs
 from neuspring.physics.arrays import Buffers, Graphs
 from neuspring.physics.controllers import ControllerSprings, begins, begun
-from neuspring.physics.lanes import ALONE, LANES
+from neuspring.physics.lanes import ALONE, LANE_WIDTH
 from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 from neuspring.physics.union import Union
 
@@ -485,7 +485,7 @@ def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
         return solver
 
     solver = narrowest = made(len(twins))
-    if device == "cpu" and len(twins) <= LANES and counts == sorted(counts, reverse=True):
+    if device == "cpu" and len(twins) <= LANE_WIDTH and counts == sorted(counts, reverse=True):
         for count in range(min(ALONE, len(twins) - 1), 0, -1):
             if counts[count] < WORTH_NARROWING * counts[0]:
                 wider, narrowest = narrowest, made(count)

@@ -22,7 +22,7 @@ from neuspring.core.artifacts import Observations, Simulation, Twin
 from neuspring.core.errors import NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import waypoints
-from neuspring.physics.lanes import LANES
+from neuspring.physics.lanes import LANE_WIDTH
 from neuspring.physics.parameters import homogeneous
 from neuspring.physics.topology import controller_reach, node_spacing, piecewise_topology, regions
 from neuspring.twin.losses import FrameLoss
@@ -217,7 +217,7 @@ def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> l
     order, size = list(range(len(twins))), together or len(twins)
     if device == "cpu":
         order.sort(key=lambda k: -twins[k].simulation.substeps)
-        size = min(size, LANES, -(-len(twins) // threads))
+        size = min(size, LANE_WIDTH, -(-len(twins) // threads))
     count = -(-len(twins) // size)
     return [order[k::count] if count <= threads else order[k * size : (k + 1) * size] for k in range(count)]
 

@@ -33,7 +33,7 @@ from neuspring.core.checkpoint import Checkpoint, TrainingLoop, adam_arrays, res
 from neuspring.core.errors import InputError, NumericalFailure
 from neuspring.physics import stability
 from neuspring.physics.controllers import ControllerSprings, waypoints
-from neuspring.physics.lanes import LANES
+from neuspring.physics.lanes import LANE_WIDTH
 from neuspring.physics.parameters import Parameters
 from neuspring.physics.solver import AdjointLimit
 from neuspring.twin.batch import FrameRequest, GradientRequest, SharedFrames, SimulatedTwin, lockstep, result_of, shared_physics
@@ -418,7 +418,7 @@ def fit_many(tasks: Sequence[FitTask], most: int = 0) -> list[FitResult | Except
         alike.setdefault(key, []).append(number)
     results: list[FitResult | Exception] = [NumericalFailure("not fitted")] * len(tasks)
     for numbers in alike.values():
-        size = most or (LANES if tasks[numbers[0]].problem.device == "cpu" else len(numbers))
+        size = most or (LANE_WIDTH if tasks[numbers[0]].problem.device == "cpu" else len(numbers))
         for first in range(0, len(numbers), size):
             batch = numbers[first : first + size]
             courses = [_course(tasks[number], share=1 / len(batch)) for number in batch]

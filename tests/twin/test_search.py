@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from neuspring import config
 from neuspring.config.search import LENGTHS
 from neuspring.physics import stability
-from neuspring.physics.lanes import LANES
+from neuspring.physics.lanes import LANE_WIDTH
 from neuspring.physics.topology import uniform_topology
 from neuspring.twin import candidates
 from neuspring.twin import search as module
@@ -437,7 +437,7 @@ def test_groups_are_a_partition_by_substeps_with_one_for_each_thread(substeps, t
     made = groups([stand_in(count) for count in substeps], "cpu", together, threads)
     order = [k for members in made for k in members]
     assert sorted(order) == list(range(len(substeps)))
-    assert all(1 <= len(members) <= min(together or LANES, LANES) for members in made)
+    assert all(1 <= len(members) <= min(together or LANE_WIDTH, LANE_WIDTH) for members in made)
     # Those with the most substeps begin, in every group and among groups.
     for slowest in ([substeps[k] for k in members] for members in (*made, [members[0] for members in made])):
         assert slowest == sorted(slowest, reverse=True)

@@ -14,7 +14,7 @@ import warp as wp
 from neuspring.core.artifacts import Twin
 from neuspring.core.device import load
 from neuspring.physics import frame
-from neuspring.physics.lanes import LANES
+from neuspring.physics.lanes import LANE_WIDTH
 from neuspring.physics.union import Union
 from neuspring.twin import trials
 from neuspring.twin.candidates import SearchProblem
@@ -145,7 +145,7 @@ def describe(bench: Bench, case: SearchProblem, result: SearchResult, seconds: d
 
 def warm(device: str) -> None:
     """Compile what a search runs, which depends on the widths of its groups."""
-    widths = (1,) if device != "cpu" else (1, LANES)
+    widths = (1,) if device != "cpu" else (1, LANE_WIDTH)
     for width in widths:
         made = frame.kernels(wp.float32, width, width == 1)
         its = [made.begin, made.substep] if device != "cpu" else [made.forward]
