@@ -93,7 +93,8 @@ class Registry(Mapping[str, T], Generic[T]):
     def about(self, name: str) -> str:
         """The first sentence of the docstring of a function, from its source: importing all functions takes seconds."""
         module, member = self._place(name)
-        source = _source(module).read_text(encoding="utf-8")
+        file = _source(module)
+        source = file.read_text(encoding="utf-8") if file.exists() else ""
         found = re.search(rf'^def {member}\(.*?"""(.+?)([.:;] |\.?$|\.?""")', source, re.DOTALL | re.MULTILINE)
         return found[1] if found else ""
 
@@ -131,4 +132,5 @@ def _left_out(point: EntryPoint) -> bool:
 def _source(module: str) -> Path:
     """The file of a module, which is not imported; its package is."""
     top, *parts = module.split(".")
-    return Path(str(import_module(top).__file__)).parent.joinpath(*parts).with_suffix(".py")
+    package = Path(str(import_module(top).__file__))
+    return package.parent.joinpath(*parts).with_suffix(".py") if parts else package

@@ -264,14 +264,12 @@ def lines_of(scores: pd.DataFrame) -> Iterator[str]:
 
 def hours(results: Path) -> Iterator[str]:
     """Hours of all finished jobs, which have a core each, by rule."""
+    records = [(record.rule, record.log, record.seconds / 3600) for record in read_jobs(results, damaged=[]) if not record.failed]
     # Members of a batch have a log in common, and each the time of all.
-    spent: dict[str, dict[str, float]] = {}
-    for record in read_jobs(results, damaged=[]):
-        if not record.failed:
-            spent.setdefault(record.rule, {})[record.log] = record.seconds / 3600
-    sums = {rule: (len(own), sum(own.values())) for rule, own in spent.items()}
-    sums = dict(sorted(sums.items(), key=lambda item: -item[1][1])) | {"all": tuple(map(sum, zip(*sums.values(), strict=True)))}
-    rows = [[rule, str(jobs), f"{total:.2f}"] for rule, (jobs, total) in sums.items()]
+    jobs = pd.DataFrame(records, columns=["rule", "log", "hours"]).drop_duplicates("log")
+    sums = jobs.groupby("rule")["hours"].agg(["size", "sum"]).sort_values("sum", ascending=False)
+    sums.loc["all"] = sums.sum()
+    rows = [[str(rule), f"{count:.0f}", f"{total:.2f}"] for rule, count, total in sums.itertuples()]
     yield from ("\n## Hours of jobs, on a core each\n", *Table.of_texts(["rule", "jobs", "hours"], rows).markdown())
 
 
