@@ -12,7 +12,6 @@ A member is an object, or text "module:name" that is imported when it is first a
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -57,8 +56,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def __getitem__(self, name: str) -> T:
         if name not in self._loaded:
             if name in self._own:
-                own = self._own[name]
-                member: Any = resolve_name(own) if isinstance(own, str) else own
+                member = _resolved(self._own[name])
             elif name in self._foreign:
                 member = self._imported(self._foreign[name])
             else:
@@ -72,7 +70,7 @@ class Registry(Mapping[str, T], Generic[T]):
             member = point.load()
         except Exception as error:
             raise InputError(where, "must be importable", f"{type(error).__name__}: {error}", remedy) from error
-        kind = resolve_name(self._type) if isinstance(self._type, str) else self._type
+        kind = _resolved(self._type)
         if not isinstance(member, kind):
             raise InputError(where, f"must be a {getattr(kind, '__name__', kind)}", type(member).__name__, remedy)
         return member
@@ -88,22 +86,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def module_of(self, name: str) -> str:
         """The module that a member is declared in, for digests of code; that of the registry's user for one given as an object."""
-        return self._place(name)[0]
-
-    def about(self, name: str) -> str:
-        """The first sentence of the docstring of a function, from its source: importing all functions takes seconds."""
-        module, member = self._place(name)
-        file = _source(module)
-        source = file.read_text(encoding="utf-8") if file.exists() else ""
-        found = re.search(rf'^def {member}\(.*?"""(.+?)([.:;] |\.?$|\.?""")', source, re.DOTALL | re.MULTILINE)
-        return found[1] if found else ""
-
-    def _place(self, name: str) -> tuple[str, str]:
-        """The module and the member's name there; empty for an object."""
-        own = self._own.get(name)
-        text = own if isinstance(own, str) else self._foreign[name].value if name in self._foreign else ""
-        module, _, member = text.partition(":")
-        return module, member
+        own = self._own.get(name) or getattr(self._foreign.get(name), "value", "")
+        return own.partition(":")[0] if isinstance(own, str) else ""
 
 
 class Unknown(InputError, KeyError):
@@ -123,14 +107,13 @@ def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else "unknown"
 
 
+def _resolved(value: Any) -> Any:
+    """What text "module:name" stands for, or the object itself."""
+    return resolve_name(value) if isinstance(value, str) else value
+
+
 def _left_out(point: EntryPoint) -> bool:
     """One of our own extensions whose folder was removed: that is how a user leaves it out."""
     module = point.value.partition(":")[0]
-    return module.split(".")[0] == OURS and not _source(module).exists()
-
-
-def _source(module: str) -> Path:
-    """The file of a module, which is not imported; its package is."""
-    top, *parts = module.split(".")
-    package = Path(str(import_module(top).__file__))
-    return package.parent.joinpath(*parts).with_suffix(".py") if parts else package
+    # To look for a module by its name would import its package.
+    return module.startswith(f"{OURS}.") and not (Path(__file__).parents[1] / f"{module.replace('.', '/')}.py").exists()

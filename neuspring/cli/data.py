@@ -58,12 +58,10 @@ def mask(
     marked.require(read, path)
     perception, carrier = read_settings(settings).perception, SEGMENTERS["marks" if backend == "marks" else "grounded_sam2"]
     wanted = cameras or tuple(name for name in read.cameras if marked.of(name))
-    for name in wanted:
+    for name in wanted or read.cameras:
         read.require_camera(name)
         if not marked.of(name):
             raise InputError(f"{path}, cameras", f"camera {name} needs marks", sorted(marked.cameras))
-    if not wanted:
-        raise InputError(f"{path}, cameras", "a camera of the capture needs marks", sorted(marked.cameras))
     made = store.MasksFile.of(read)
     for name in wanted:
         source = store.source_digest(read, name, marked.of(name), backend)
@@ -79,8 +77,7 @@ def mask(
         print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:DOUBTFUL_FRAMES_SHOWN]
         print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
-    without = [name for name in read.cameras if not store.has_masks(read, [name])]
-    if without:
+    if without := [name for name in read.cameras if not store.has_masks(read, [name])]:
         print(f"cameras without masks: {', '.join(without)}; {read.folder / 'capture.json'} says masks: true when all have some")
 
 

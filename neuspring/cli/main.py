@@ -11,10 +11,12 @@ import argparse
 import difflib
 import errno
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from neuspring.core.errors import InputError, NumericalFailure, full_disk
 from neuspring.core.version import __version__
@@ -83,24 +85,31 @@ def _run(words: list[str]) -> int:
 
         function = COMMANDS[tools[command]]
         rest, options = words[len(command.split()) :], (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-        about = (function.__doc__ or "").strip()
-        return tyro.cli(function, args=rest, prog=f"neuspring {command}", description=about, config=options) or 0
+        return tyro.cli(function, args=rest, prog=f"neuspring {command}", description=function.__doc__, config=options) or 0
     from neuspring.stages import STAGES
 
     if command in STAGES:
         STAGES[command](**STAGES[command].parse(words[1:]))
         return 0
-    close = [name for name in tools if name.startswith(f"{words[0]} ")]
-    close = close or difflib.get_close_matches(command, [*STAGES, *tools], n=1)
+    close = [name for name in tools if name.startswith(f"{words[0]} ")] or difflib.get_close_matches(
+        command, [*STAGES, *tools], n=1
+    )
     remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
     raise InputError("command", "must be a stage or a tool", command, remedy)
+
+
+def _about(registry: Registry[Any], name: str) -> str:
+    """The first sentence of a command's docstring; of ours from the source, for to import all of them takes seconds."""
+    file = Path(__file__).parents[2] / f"{registry.module_of(name).replace('.', '/')}.py"
+    start = f"def {name.replace('-', '_').replace('.', '_')}("
+    text = file.read_text(encoding="utf-8").partition(start)[2].split('"""')[1] if file.exists() else registry[name].__doc__
+    return re.split(r"[.:;] |\.?\n|\.$", text or "")[0]
 
 
 def _overview() -> str:
     from neuspring.stages import STAGES
 
-    stages, tools = ([f"  {name.replace('.', ' '):<17} {each.about(name)}" for name in each] for each in (STAGES, COMMANDS))
-    head = (
-        "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n\nSpring-mass twins of deformable objects from RGBD video."
-    )
-    return "\n".join([head, "\nStages of the workflow, each by hand:", *stages, "\nTools:", *tools])
+    stages, tools = ([f"  {name.replace('.', ' '):<17} {_about(each, name)}" for name in each] for each in (STAGES, COMMANDS))
+    usage = "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n"
+    about = "Spring-mass twins of deformable objects from RGBD video.\n\nStages of the workflow, each by hand:"
+    return "\n".join([usage, about, *stages, "\nTools:", *tools])

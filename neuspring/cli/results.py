@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from neuspring.cli.options import Positional, Results, Settings, arg, json_value, read_settings
 from neuspring.config import parse
 from neuspring.core.errors import InputError
-from neuspring.scores.paper import Study, read_studies
+from neuspring.scores.paper import read_studies
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,14 +76,6 @@ def tables(
     print(f"Tables: {output / 'summary.md'}")
 
 
-def _study(table: Path, extra: Sequence[Path], name: str) -> Study:
-    """A study of the study table, or of files of extra rows. Raises InputError."""
-    studies = read_studies(table, extra)
-    if name not in studies:
-        raise InputError("study", f"must be a row of {table}", name, f"Known: {', '.join(studies)}")
-    return studies[name]
-
-
 def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> ScoreTable:
     from neuspring.scores.table import read_scores
 
@@ -117,7 +109,10 @@ def study(
     """The scores.csv that `tables` wrote -> one of the paper's tables, beside the paper's values."""
     from neuspring.report.study import write_study
 
-    one = _study(table, extra_rows, study)
+    studies = read_studies(table, extra_rows)
+    if study not in studies:
+        raise InputError("study", f"must be a row of {table}", study, f"Known: {', '.join(studies)}")
+    one = studies[study]
     if scores and one.kind:
         remedy = "Leave out --scores and name --results."
         raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)

@@ -16,7 +16,6 @@ EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
     "fit.epochs": (20, 40, 200),
     "perception.sample.voxel": (0.006, 0.006, 0.005),
     "perception.sample.nodes": (300, 400, None),
-    "images.views": ("first", "first", "first"),
     "images.appearance.iterations": (150, 400, 10_000),
     "images.appearance.opacity_rate": (0.05, 0.025, 0.025),
     "images.appearance.spacing": (2.0, 2.0, 0.0),

@@ -243,7 +243,7 @@ class Stage:
     @property
     def about(self) -> str:
         """Its products and inputs, in a line."""
-        return (inspect.getdoc(self.function) or "").partition("\n")[0].partition(": ")[0].rstrip(".")
+        return re.split(r": |\.?\n|\.$", inspect.getdoc(self.function) or "")[0]
 
     @functools.cached_property
     def product(self) -> str:
