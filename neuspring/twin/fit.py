@@ -59,7 +59,8 @@ ROLLOUT_EVERY = 5
 PLATEAU_EPOCHS = 40
 """Epochs without a better twin after which a fit has converged."""
 MOST_GROWTH = 3.0
-"""Substeps at most, as a multiple of the search's: a few springs that stiffen without end would set the cost of all."""
+"""Substeps that dashpots alone and stiffness alone may ask for, as a multiple of the search's; both together ask for fewer than five
+times as many. A few springs that stiffen without end would set the cost of all."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
@@ -292,7 +293,9 @@ class TwinFit:
         others = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
         self.recordings = [FitRecording(problem, *one) for one in [(problem.observations, problem.twin), *others]]
         if self.recordings[0].most_substeps:
-            self.parameters.growth = MOST_GROWTH
+            spectrum, substep = stability.twin_spectrum(problem.twin), problem.twin.simulation.substep
+            self.parameters.dashpot_growth = MOST_GROWTH
+            self.parameters.stiffness_growth = MOST_GROWTH**2 * spectrum.load(substep) / (substep**2 * spectrum.stiffness)
         self.trained = list(self.parameters.parameters())
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2

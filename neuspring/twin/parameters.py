@@ -3,10 +3,10 @@
 Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`).
 With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
-    Y = Y0 exp(b(o)), clamped to the stiffness range, and to g^2 times its value in the search.
+    Y = Y0 exp(b(o)), clamped to the stiffness range, and to g times its value in the search.
 
-Dashpots are clamped to g times their value there. With both the substeps that a twin needs grow at most g-fold, for its matrices
-of stiffness and damping grow at most as their fastest growing spring.
+Dashpots are clamped as well. Both bounds limit the substeps that a twin needs: its matrices of stiffness and damping grow at most
+as their fastest growing spring.
 
 Beside them: four contact scalars, and common factors exp(.) of stiffness (`global_stiffness`), drag and
 dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
@@ -97,8 +97,8 @@ class TwinParameters(nn.Module):
         self.to(device)
         self.first = self.copy()
         """The trained values before the first step."""
-        self.growth = 1e3
-        """g of the head of this file; as it is here no fit reaches it."""
+        self.stiffness_growth, self.dashpot_growth = 1e6, 1e3
+        """Largest factors over the start; no fit reaches these."""
 
     def _factor_names(self) -> list[str]:
         """Common factors that are trained: what they scale, `controller_` before it where of those springs."""
@@ -144,11 +144,11 @@ class TwinParameters(nn.Module):
         stiffness = start["stiffness"] * (self.deviation() * self._common("stiffness"))
         # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
-        values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.growth**2 * start["stiffness"]), *s.stiffness_range)
+        values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.stiffness_growth * start["stiffness"]), *s.stiffness_range)
         for name in DAMPING_FACTORS:
             if name in self.factors:
                 values[name] = start[name] * self._common(name)
-        values["dashpot"] = inward_clamp(values["dashpot"], 0.0, self.growth * start["dashpot"])
+        values["dashpot"] = inward_clamp(values["dashpot"], 0.0, self.dashpot_growth * start["dashpot"])
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float, start: Mapping[str, torch.Tensor] | None = None) -> Parameters:

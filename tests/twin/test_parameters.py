@@ -151,10 +151,10 @@ def test_the_start_is_the_twin_whatever_is_trained(kind):
 
 
 def test_the_bound_of_stiffness():
-    """However far the offsets go; and within the square of the growth."""
-    for sign, growth, most in ((-1.0, 1e3, np.exp(-1.5)), (1.0, 1e3, np.exp(1.5)), (1.0, 2.0, 4.0)):
+    """However far the offsets go; and within its growth over the search."""
+    for sign, growth, most in ((-1.0, 1e3, np.exp(-1.5)), (1.0, 1e3, np.exp(1.5)), (1.0, 4.0, 4.0)):
         trained = offsets(parameters("springs", **ALL), sign * 50.0)
-        trained.growth = growth
+        trained.stiffness_growth = growth
         torch.testing.assert_close(trained.physical()["stiffness"], trained.start["stiffness"] * most, rtol=SINGLE, atol=0)
 
 
