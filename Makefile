@@ -1,8 +1,8 @@
-# make install | demo | play | test | test-all | lint | bench | gpu: each makes or reuses .venv by itself; make findings needs python3 alone.
+# make install | demo | play | test | test-all | lint | bench | gpu: each creates or reuses .venv. make findings needs only python3.
 SUITS := -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do $$p $(SUITS) && echo $$p && break; done)
 BIN := .venv/bin
-# Two marks: what the demo needs is installed; and so is what tests and linters need, which has the demo's.
+# Marker files: the packages of the demo are installed; all packages, with those of tests and linters, are installed.
 COMMA := ,
 DEMO := .venv/.demo
 INSTALLED := .venv/.installed
@@ -34,7 +34,7 @@ $(INSTALLED): pyproject.toml workflow/envs/constraints.txt
 
 install: $(INSTALLED)
 
-# Whatever marks it holds, a .venv whose Python is gone or too old is made again.
+# A .venv whose Python is missing or too old is replaced, whatever marker files it contains.
 ifneq ($(shell test ! -e .venv -a ! -L .venv || $(BIN)/python $(SUITS) || echo wrong),)
 .PHONY: again
 $(DEMO) $(INSTALLED): again
@@ -48,8 +48,8 @@ demo: $(RUNS)
 play: $(RUNS)
 	$(BIN)/neuspring play
 
-# The twin that travels with the package (neuspring/data/sample.py), made again: a run of the demo with fewer splats, and
-# those of its files that a twin needs.
+# Make the packaged twin again (neuspring/data/sample.py): a run of the demo with fewer splats, of which only the files of the twin
+# are kept.
 SAMPLE := synthetic_single_lift_sloth
 SAMPLE_RUN := run.json fit.json twin.npz rollout.json trajectory.npz scores.parquet history.parquet
 sample: $(RUNS)
@@ -64,14 +64,14 @@ sample: $(RUNS)
 test: $(INSTALLED)
 	$(PYTEST) --dist worksteal -m "not slow"
 
-# The core stands without its extensions: a copy of the tracked files, less both folders.
+# Test the core without extensions, in a copy of the tracked files without both folders of extensions.
 test-core: $(INSTALLED)
 	rm -rf .core && mkdir .core && git ls-files -z ':!neuspring/extensions' ':!tests/extensions' | xargs -0 cp --parents -t .core
 	cd .core && PYTHONPATH=$(CURDIR)/.core PATH="$(CURDIR)/$(BIN):$$PATH" OMP_NUM_THREADS=1 \
 		$(CURDIR)/$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m "not slow"
 	rm -rf .core
 
-# Clusters, databases and crowds of processes: a file's tests share one of them, so that a file stays with one worker.
+# The tests of a file share a cluster, a database or a group of processes, so each file stays with one worker.
 test-slow: $(INSTALLED)
 	$(PYTEST) --dist loadfile -m slow
 
@@ -94,12 +94,12 @@ bench: $(INSTALLED)
 	$(BIN)/python -m results.published.bench.splats
 	$(BIN)/python -m results.published.bench.spring_gaus
 
-# Needs a GPU; `make gpu GPU_OPTIONS="-k fit"` passes options to pytest. See results/published/bench/GPU.md.
+# Requires a GPU; `make gpu GPU_OPTIONS="-k fit"` passes options to pytest. See results/published/bench/GPU.md.
 gpu: $(INSTALLED)
 	$(BIN)/python -m pytest -m cuda $(GPU_OPTIONS) $(shell grep -rlE '\b(DEVICES|WAYS)\b|import CUDA|mark\.cuda' --include='test_*.py' tests)
 	$(BIN)/python -m results.published.bench --device cuda:0
 
-# Each script says whether an outside library still behaves as its head says: 0 yes, 1 no, else it could not run.
+# Each script tests whether an external library still behaves as the script's head says. Exit status 0: yes, 1: no, else: not run.
 findings:
 	@changed=; missed=; for script in findings/*.sh; do \
 		echo "== $$script"; status=0; bash "$$script" || status=$$?; \

@@ -1,4 +1,4 @@
-# The benchmark: captures -> observations -> search -> fit -> predictions, images and scores -> tables, every run in MLflow.
+# The workflow: captures -> observations -> search -> fit -> predictions, images and scores -> tables; all runs in MLflow.
 from snakemake.utils import min_version
 
 min_version("9.20")
@@ -11,7 +11,7 @@ include: "workflow/rules/common.smk"
 include: "workflow/rules/jobs.smk"
 
 
-# On a cluster these run where Snakemake runs: seconds of work each.
+# On a cluster these rules run on the machine of Snakemake, because each takes only seconds.
 localrules:
     all,
     sweep,
@@ -45,10 +45,10 @@ rule sweep:
         target(lambda graph, tasks: [graph.unit("sweep_report", "all")]),
 
 
-# A study of the paper is a target by its name, which must not be another's.
+# The name of each study is a target, so it must differ from all other targets.
 for STUDY in BENCHMARK.studies:
     if STUDY in {other.name for other in workflow.rules}:
-        reason = "this is the name of another target; rename the study."
+        reason = "another target has this name; rename the study."
         raise WorkflowError(f"{CONFIG.study_table}, study {STUDY}: {reason}")
 
     rule:

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Guess: a body with mocap="true" that is moved a little in each step moves for the physics too: what lies on it is carried along by
-#   friction, and a damped spring between it and a node damps their relative motion.
-# Seen: it moves and has no velocity. A tray that slides 0.4 m in 2 s leaves the box on it where it was, to 0.001 mm. A node that is
-#   drawn at 0.2 m/s by a spring with k = 1000 N/m and a dashpot with c = 20 N s/m stays back by c v / k = 4 mm for good; a dashpot
-#   between two things that move alike has no force.
+# Guess: a mocap="true" body that moves a little in each step also moves for the physics. Friction carries objects that lie on it, and a
+#   damped spring between it and a node damps their relative motion.
+# Seen: the body moves but has no velocity. A tray that slides 0.4 m in 2 s leaves its box in place, to 0.001 mm. A node that a spring
+#   (k = 1000 N/m) and a dashpot (c = 20 N s/m) pull at 0.2 m/s stays behind by c v / k = 4 mm. A dashpot between two bodies with the same
+#   motion must have no force.
 # Source: mujoco-core 4.0.0; XML reference, body/mocap ("fixed from the viewpoint of the dynamics"), geom/surfacevel.
-# Matters: recorded hands, grippers and clamps are replayed as mocap bodies. Pushing works, so it looks right; dragging, lifting by
-#   friction and damped attachments do not, and a fit against the recording puts that into friction or stiffness.
-# Works: a free body with gravcomp="1", welded to the mocap body; for what lies on a tray also surfacevel of its geom, in the file.
+# Matters: recorded hands, grippers and clamps are replayed as mocap bodies. Pushing works, so the result appears right. Dragging, lifting
+#   by friction and damped attachments do not work, and a fit to the recording attributes this to friction or stiffness.
+# Works: a free body with gravcomp="1", welded to the mocap body. For objects on a tray, also set surfacevel of its geom in the file.
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

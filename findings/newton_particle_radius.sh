@@ -1,13 +1,12 @@
 #!/usr/bin/env bash
-# Guess: ModelBuilder.add_particle(position, velocity, mass) makes a point mass, and nodes of a lattice act on each other by their springs
-#   alone.
-# Seen: each particle is a ball of radius 0.1 m that repels the others, also those it has a spring to, with SolverSemiImplicit and
-#   SolverXPBD; SolverVBD leaves particles alone. Two particles at rest 0.1 m apart, without gravity or spring, fly apart by meters or
-#   tens of meters within a second, and a spring of rest length 0.1 m, let go at 0.13 m, never comes back to 0.1 m. No warning.
+# Guess: ModelBuilder.add_particle(position, velocity, mass) makes a point mass, and nodes of a lattice interact through their springs only.
+# Seen: each particle is a ball of radius 0.1 m that repels the others, also its neighbors along springs, with SolverSemiImplicit and
+#   SolverXPBD. SolverVBD has no such force. Two particles at rest 0.1 m apart, without gravity or spring, separate by meters or tens of
+#   meters within a second. A spring of rest length 0.1 m, released at 0.13 m, never returns to 0.1 m. There is no warning.
 # Source: newton 1.8.0; ModelBuilder.default_particle_radius is 0.1.
-# Matters: a reconstructed plush has nodes 1 to 3 cm apart: it bursts in two solvers and holds in the third, which looks like a fault of
+# Matters: a reconstructed plush has nodes 1 to 3 cm apart. It explodes in two solvers and not in the third, which resembles a wrong
 #   stiffness or time step.
-# Works: a radius far below half a node spacing, by radius= or by builder.default_particle_radius before the first particle.
+# Works: a radius far below half the node spacing, by radius= or by builder.default_particle_radius before the first particle.
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Guess: cv2.imread reads a depth map in .exr once OPENCV_IO_ENABLE_OPENEXR=1 is set before the import, as every answer says, and
-#   without it there is an error that names the variable.
-# Seen: so it is in the wheel of 4.14.0.94. That of 5.0.0.93 is built without OpenEXR: imread returns None with the variable and without
-#   it, in silence, and haveImageReader is False.
+# Guess: cv2.imread reads a depth map in .exr if OPENCV_IO_ENABLE_OPENEXR=1 is set before the import, as all advice says. Without the
+#   variable, an error names it.
+# Seen: the wheel of 4.14.0.94 behaves so. The wheel of 5.0.0.93 is built without OpenEXR: imread returns None with and without the
+#   variable, without a message, and haveImageReader is False.
 # Source: opencv-python-headless 5.0.0.93 and 4.14.0.94, OpenEXR 3.5.3; cv2.getBuildInformation(), line OpenEXR; for the advice,
 #   opencv/opencv issue 21928.
-# Matters: renderers and depth networks write .exr. An update of OpenCV turns each depth map into None, which a loader that skips what it
-#   cannot read takes for "no depth here".
+# Matters: renderers and depth networks write .exr. An update of OpenCV turns each depth map into None. A loader that skips unreadable
+#   files takes this for missing depth.
 # Works: OpenEXR.File(path).channels()[name].pixels.
 set -eu
 folder=$(mktemp -d)

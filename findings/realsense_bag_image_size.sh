@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Guess: a recording of librealsense is a ROS 1 bag that holds the definitions of its messages, so any reader of bags gives its images.
+# Guess: a recording of librealsense is a ROS 1 bag that contains the definitions of its messages, so any reader of bags returns its images.
 # Seen: each image is four bytes longer than the bag's own definition of sensor_msgs/Image, and rosbags refuses it: "ROS1 message size
 #   mismatch". The four bytes are a float: meters per count for depth, 0 for color. The checksum of the type is still that of ROS.
 # Source: pyrealsense2 2.56.5.9235, rosbags 0.11.9; Image.h of librealsense (third-party/realsense-file/rosbag/msgs/sensor_msgs) writes
-#   depth_units behind data where the header's version is "1", and does not name it in the definition beside it.
-# Matters: recordings of these cameras are a common start of a reconstruction. A reader that skips what it cannot read has no images; one
-#   that ignores the four bytes has the images and loses the only unit of depth that stands beside them.
-# Works: get_msgdef(type).deserialize_ros1, which says where it ended; what is left is the unit.
+#   depth_units after data if the header's version is "1", and its definition in the same file does not contain it.
+# Matters: many reconstructions start from recordings of these cameras. A reader that skips unreadable messages returns no images. A
+#   reader that ignores the four bytes loses the only unit of depth in the message.
+# Works: get_msgdef(type).deserialize_ros1 returns where it ended; the remaining bytes are the unit.
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

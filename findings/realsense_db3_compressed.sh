@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Guess: since 2.58 librealsense records to ROS 2 (.db3, "serialization_format: cdr"), so readers of ROS 2 read what it records by default.
-# Seen: topics and counts are listed, and not one message can be read: "Invalid or unsupported CDR encapsulation". Each message, text
-#   too, is a frame of Zstandard of its own, because rs.recorder(file, device) compresses, and nothing in the file says so: ROS 2 keeps
-#   that in a metadata.yaml, and librealsense writes none.
-# Source: pyrealsense2 2.58.4.10922, rosbags 0.11.9; doc/record-and-playback.md of librealsense, whose later text (2.59) has compressed
-#   recordings as PNG in CompressedImage.
-# Matters: films recorded with 2.58 look damaged to tools that are not librealsense's, and the frames are all there.
-# Works: rs.recorder(file, device, False) before, or Zstandard over each message after.
+# Guess: since 2.58 librealsense records to ROS 2 (.db3, "serialization_format: cdr"), so readers of ROS 2 read its default recordings.
+# Seen: readers list topics and counts but cannot read one message: "Invalid or unsupported CDR encapsulation". Each message, also text,
+#   is a Zstandard frame, because rs.recorder(file, device) compresses. The file does not say so: ROS 2 states compression in a
+#   metadata.yaml, and librealsense writes none.
+# Source: pyrealsense2 2.58.4.10922, rosbags 0.11.9; doc/record-and-playback.md of librealsense, whose later text (2.59) describes
+#   compressed recordings as PNG in CompressedImage.
+# Matters: recordings of 2.58 appear damaged to other tools, although all frames are there.
+# Works: record with rs.recorder(file, device, False), or decompress each message with Zstandard.
 set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Guess: in a ROS 2 recording of librealsense, header.stamp of an image is when the camera took it, as in ROS and in the .bag of its
+# Guess: in a ROS 2 recording of librealsense, header.stamp of an image is the time of exposure, as in ROS and in the .bag of its
 #   version 2.56, and 16UC1 depth is in millimeters (REP 118).
-# Seen: header.stamp is when the image reached the recorder, counted from the start of the recording, so it begins near 0 and has the
-#   arrival's jitter. The time of the camera is in text, in image/metadata, in milliseconds. Depth is in counts of the device, whose size
-#   is text in option/Depth_Units/value: at 0.1 mm a reader that follows ROS sees all ten times too far, with neither error nor warning.
+# Seen: header.stamp is the time at which the image reached the recorder, counted from the start of the recording. It begins near 0 and
+#   has the jitter of arrival. The camera's time is text in image/metadata, in milliseconds. Depth is in counts of the device, whose size
+#   is text in option/Depth_Units/value. At 0.1 mm a reader that follows ROS returns ten times the distance, without error or warning.
 # Source: pyrealsense2 2.59.1.11053, rosbags 0.11.9; src/media/ros2/ros2_writer.cpp of librealsense; REP 118 of ROS.
-# Matters: two cameras recorded so cannot be put on one clock by their headers, and steps between frames are those of the computer, so
-#   speeds are wrong. A body reconstructed with the usual unit has another size, and with gravity in m/s2 another stiffness.
+# Matters: headers cannot synchronize two cameras. Steps between frames are those of the computer, so velocities are wrong. An object
+#   that is reconstructed with the usual unit has a wrong size, and with gravity in m/s2 a wrong stiffness.
 # Works: read timestamp= in image/metadata and the value of Depth_Units.
 set -eu
 folder=$(mktemp -d)

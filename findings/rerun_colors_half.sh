@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Guess: colors as floats from 0 to 1 are scaled to 0 to 255, as the documentation of Points3D says, in half precision too.
-# Seen: float32 and float64 are scaled. float16 is cut to whole numbers: 1.0 becomes 1 of 255 and all below it 0, so everything is black.
-#   Neither error nor warning, and none with strict=True.
+# Guess: colors as floats from 0 to 1 are scaled to 0 to 255, as the documentation of Points3D says, also in half precision.
+# Seen: float32 and float64 are scaled. float16 is cut to integers: 1.0 becomes 1 of 255 and smaller values 0, so everything is black.
+#   There is no error and no warning, also with strict=True.
 # Source: rerun-sdk 0.41.0; rerun.Points3D, parameter colors ("either 0-1 floats or 0-255 integers").
-# Matters: colors of splats and of networks are often kept in half precision. Their recording is black, which looks like a lost exposure
-#   or wrong harmonics.
+# Matters: colors of splats and of networks are often in half precision. Their recording is black, which resembles a wrong exposure or
+#   wrong harmonics.
 # Works: colors.astype("float32"), or numpy.rint(255 * colors).astype("uint8").
 set -eu
 folder=$(mktemp -d)

@@ -1,6 +1,6 @@
-"""NeuSpring: spring-mass twins of deformable objects from RGBD video, as an open, workflow-orchestrated platform.
+"""NeuSpring: spring-mass twins of deformable objects from RGBD video, with a Snakemake workflow.
 
-The functions and classes of `neuspring.api` stand here as well, and are imported when they are first asked for.
+The functions and classes of `neuspring.api` are also available here; they are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,10 +1,10 @@
-"""Functions for researchers in Python: `import neuspring as ns`.
+"""The Python interface: `import neuspring as ns`.
 
     run = ns.load_run()  # the sample twin, or "results/<scenario>/<method>/<seed>"
     print(run.summary())
     ns.show(ns.roll_out(run.twin, run.observations), run.observations)
 
-The workflow's stages call the same functions, so that results are equal.
+The workflow's stages call the same functions, so results are equal.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ __all__ = [
     "fit", "load_run", "move", "roll_out", "sample_twin", "score", "search", "show", "twin_from_capture", "with_mass",
 ]  # fmt: skip
 Settings = Config | Mapping[str, Any] | Path | str | None
-"""An object, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files (with commas between them), or none: the defaults."""
+"""A `Config`, values as in a YAML file (`{"fit": {"epochs": 60}}`), YAML files separated by commas, or None: the defaults."""
 
 
 def load_run(folder: Path | str | None = None) -> RunFolder:
-    """A run of the workflow, `results/<scenario>/<method>/<seed>`: its `twin`, `trajectory`, `observations`, `scores`, `records`.
+    """Load a run, `results/<scenario>/<method>/<seed>`, with `twin`, `trajectory`, `observations`, `scores` and `records`.
 
-    Without a folder it is the twin that travels with the package (`sample_twin`).
-    Raises InputError if the folder holds no run, and where what was asked for is missing, damaged or of another version.
+    Without a folder, load the twin that is part of the package (`sample_twin`). Raises InputError if the folder contains no run.
+    The properties raise InputError if their file is missing, damaged or of another version.
     """
     run = RunFolder.of(sample_twin() if folder is None else Path(folder))
     if not run.stages:
-        remedy = "Name results/<scenario>/<method>/<seed>; `make demo` makes some."
+        remedy = "Name a folder results/<scenario>/<method>/<seed>, for example of `make demo`."
         raise InputError(folder, "must be the folder of a run", "no record of a stage", remedy)
     return run
 
@@ -63,11 +63,13 @@ def twin_from_capture(
     device: str = "auto",
     threads: int = 1,
 ) -> RunFolder:
-    """A capture folder -> the run with its fitted `twin`: perceive, search, fit, predict and score, by the workflow's stages.
+    """Fit a twin to a capture folder: perceive, search, fit, predict and score with the workflow's stages; returns the run.
 
-    Files lie as the workflow's, and the run in `output`/<name of the folder>/python/<seed>; a search that was stopped goes on.
-    `config/data/own.yaml` has settings for a laptop. The twin has `mass`, kg, where it is given (`with_mass`); `clusters`, `body`
-    and `kind` are those of `search` and `fit`. Raises InputError, and NumericalFailure where search or fit fails.
+    Files have the workflow's layout in `output`; the run is `output`/<name of the folder>/python/<seed>. An interrupted search
+    resumes. `config/data/own.yaml` contains settings for a laptop. `mass`, kg, rescales the twin (`with_mass`). `clusters`,
+    `body` and `kind` are passed to `search` and `fit`.
+
+    Raises InputError, and NumericalFailure if search or fit fails.
     """
     from neuspring.core.records import StageRecord
     from neuspring.data.capture import CAPTURE
@@ -80,17 +82,17 @@ def twin_from_capture(
     read = dataclasses.replace(read_settings(settings), data_root=str(folder.parent))
     regions, method = read.clusters if clusters is None else clusters, "python"
     kind = kind or {"lattice": "field"}.get(body, body)
-    own = {"capture": folder / CAPTURE, "scenario": row, "clusters": regions, "body": body, "kind": kind, "method": method}
-    own |= {"seed": seed, "device": device, "threads": threads}
-    own |= {"variant": {"search": body, "clusters": regions, "fit": kind}}
+    common = {"capture": folder / CAPTURE, "scenario": row, "clusters": regions, "body": body, "kind": kind, "method": method}
+    common |= {"seed": seed, "device": device, "threads": threads}
+    common |= {"variant": {"search": body, "clusters": regions, "fit": kind}}
 
-    def made(stage: str, **given: Any) -> Path:
-        one = STAGES[stage]
-        words = {"scenario": row.scenario, "search": method, "method": method, "seed": seed, **given}
-        path: Path = Path(output) / one.output.format(**words)
+    def made(name: str, **given: Any) -> Path:
+        stage = STAGES[name]
+        wildcards = {"scenario": row.scenario, "search": method, "method": method, "seed": seed, **given}
+        path: Path = Path(output) / stage.output.format(**wildcards)
         path.parent.mkdir(parents=True, exist_ok=True)
-        one(output=path, settings=read, **{name: value for name, value in (own | given).items() if name in one.parameters})
-        if stage in ("search", "fit") and (record := StageRecord.load(path)).status == "failed":
+        stage(output=path, settings=read, **{key: value for key, value in (common | given).items() if key in stage.parameters})
+        if name in ("search", "fit") and (record := StageRecord.load(path)).status == "failed":
             raise NumericalFailure(record.reason)
         return path
 
@@ -99,10 +101,10 @@ def twin_from_capture(
         masks = [made("segment", camera=camera) for camera in cameras]
         tracks = [made("track", camera=camera, masks=path) for camera, path in zip(cameras, masks, strict=True)]
         lifted = {"lifted": made("lift", masks=masks, tracks=tracks)}
-    seen = {"observations": made("observe", **lifted)}
-    found = {"search": made("search", **seen)}
-    found |= {"fit": made("fit", **seen, **found)}
-    run = made("score", **seen, **found, rollout=made("rollout", **seen, learned=found["fit"])).parent
+    observed = {"observations": made("observe", **lifted)}
+    learned = {"search": made("search", **observed)}
+    learned |= {"fit": made("fit", **observed, **learned)}
+    run = made("score", **observed, **learned, rollout=made("rollout", **observed, learned=learned["fit"])).parent
     loaded = load_run(run)
     if mass is not None and loaded.twin is not None:
         vars(loaded)["twin"] = with_mass(loaded.twin, mass)
@@ -110,9 +112,9 @@ def twin_from_capture(
 
 
 def with_mass(twin: Twin, mass: float) -> Twin:
-    """The twin with so much `mass` in all, kg, which moves as before; without it a node has 1 kg, since no film shows a weight.
+    """The twin with the total `mass`, kg, and unchanged motion. By default a node has 1 kg, because a video shows no weight.
 
-    All that is in N or kg is multiplied by the same factor. Raises InputError unless the mass is positive.
+    All values in N or kg are multiplied by the same factor. Raises InputError unless the mass is positive.
     """
     from neuspring.twin.body import with_mass as weighed
 
@@ -128,11 +130,11 @@ def show(
     *,
     film: bool = False,
 ) -> InlinePicture:
-    """A picture of a run, a twin or a prediction; as the last value of a notebook's cell it is shown there.
+    """Draw a run, a twin or a prediction; a notebook shows the result if it is the last value of a cell.
 
-    A twin is colored by stiffness. A prediction is drawn in a few frames, beside what was seen where `observations` are given;
-    those of a run are known. With `film` all frames move (GIF). `output` is a file to write: a picture .png, .jpg, .svg, .pdf, or a
-    film .gif, .mp4. Raises InputError.
+    A twin is colored by stiffness. A prediction is drawn in a few frames, next to the `observations` if they are given; a run has
+    its own. `film` draws all frames as a GIF. `output` is a file to write: a figure (.png, .jpg, .svg, .pdf) or a video (.gif,
+    .mp4). Raises InputError.
     """
     from neuspring.draw.show import show as drawn
 
@@ -140,10 +142,10 @@ def show(
 
 
 def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto") -> Trajectory:
-    """Simulate a twin from frame 0 under hands that move, as the workflow does: positions [T, N, 3], m.
+    """Simulate a twin from frame 0 with moving controllers, as the workflow does: positions [T, N, 3], m.
 
-    `hands` are observations, or the position of every controller in every frame [T, C, 3], m, the first as in the twin. A
-    rollout that diverges is a result: its `diverged_frame` and `reason` say so. Raises InputError for another shape.
+    `hands` are observations, or the positions of all controllers in all frames [T, C, 3], m; frame 0 must match the twin. If the
+    rollout diverges, the trajectory ends early and has a `diverged_frame` and a `reason`. Raises InputError for another shape.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin import rollout
@@ -160,9 +162,9 @@ def roll_out(twin: Twin, hands: Observations | np.ndarray, device: str = "auto")
 
 
 def move(twin: Twin, observations: Observations, settings: Settings = None) -> Twin:
-    """A twin in frame 0 of another recording of its object, whose node i is the twin's node i; `roll_out` predicts that recording.
+    """Move a twin to frame 0 of another recording of its object; `roll_out` then predicts that recording.
 
-    Raises InputError for a recording of another object.
+    Nodes must be in the same order in both. Raises InputError for a recording of another object.
     """
     from neuspring.twin.transfer import move as moved
 
@@ -171,7 +173,7 @@ def move(twin: Twin, observations: Observations, settings: Settings = None) -> T
 
 
 def score(trajectory: Trajectory, observations: Observations) -> pd.DataFrame:
-    """Mean errors of a prediction, in meters: one row per task (reconstruction: training frames; future) and metric."""
+    """Mean errors of a prediction, m: one row per task (reconstruction: training frames; future) and metric."""
     from neuspring.scores import metrics
 
     return metrics.score(trajectory, observations, method="", seed=0)[["task", "metric", "value", "unit", "frames"]]
@@ -188,10 +190,10 @@ def search(
     threads: int = 1,
     record: Path | None = None,
 ) -> Learned:
-    """CMA-ES over material and topology: the best `twin`, its `cost`, the `trace`.
+    """Search material and topology with CMA-ES; returns the best `twin`, its `cost` and the `trace`.
 
-    The topology has `clusters` regions, by default as many as the settings say; 1 is uniform. The trace is kept in the file
-    `record`, and a search that was stopped goes on from it. A package may bring `body`. Raises InputError, NumericalFailure.
+    The topology has `clusters` regions, by default the number in the settings; 1 is uniform. The trace is written to the file
+    `record`, from which an interrupted search resumes. Packages may add values of `body`. Raises InputError and NumericalFailure.
     """
     from neuspring.core.device import resolve_device
     from neuspring.twin.body import BODIES, SearchOptions
@@ -213,12 +215,11 @@ def fit(
     checkpoint: Path | None = None,
     mass: float | None = None,
 ) -> Learned:
-    """Train a twin's stiffness by gradients through the simulation, as a neural spring `field` or each of the `springs` apart.
+    """Fit a twin's stiffness with gradients through the simulation; returns the best `twin` and the `history` of losses.
 
-    Another body has fits of its own kinds (`Body.fits`).
-
-    The result has the best `twin`, of this `mass`, kg, where it is given (`with_mass`), and the `history` of losses. With a
-    `checkpoint`, a fit of the same twin, observations and settings that was stopped goes on. Raises InputError, NumericalFailure.
+    `kind`: a neural spring field (field) or every spring separately (springs); other bodies have other kinds (`Body.fits`).
+    `mass`, kg, rescales the twin (`with_mass`). From the file `checkpoint`, an interrupted fit of the same twin, observations and
+    settings resumes. Raises InputError and NumericalFailure.
     """
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.device import resolve_device
@@ -237,7 +238,7 @@ def fit(
         kind=kind,
         seed=seed,
     )
-    # The number of epochs is not part of it: a longer fit begins with the same ones.
+    # The key excludes the number of epochs: a longer fit starts with the same epochs.
     made_of = {name: plain(getattr(read, name)) for name in ("fit", "simulation", "losses", "released_quirks")}
     made_of["fit"].pop("epochs")
     inputs = {"twin": twin.digest, "observations": observations.digest}
@@ -247,7 +248,7 @@ def fit(
 
 
 def read_settings(settings: Settings) -> Config:
-    """Settings from any of their forms. Raises InputError for unknown keys and wrong values."""
+    """Read settings from any of their forms. Raises InputError for unknown keys and invalid values."""
     if isinstance(settings, Config):
         return settings
     if settings is None or isinstance(settings, Mapping):

@@ -1,12 +1,12 @@
-"""The door of each kind of thing: our own members, and those that installed packages bring.
+"""Registries of metrics, baselines, stages and other kinds: members of this package and of installed packages.
 
-A kind is a `Registry` beside the code that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds to it by an entry point
-of the group `neuspring.<kind>`, in its pyproject.toml, and nothing here changes:
+Each kind is a `Registry` in the module that uses it (`METRICS`, `BASELINES`, `STAGES`, ...). A package adds a member by an entry
+point of the group `neuspring.<kind>` in its pyproject.toml:
 
     [project.entry-points."neuspring.metrics"]
     my_error = "my_package.errors:MY_ERROR"
 
-A member is an object, or text "module:name" that is imported when it is first asked for, so that listing names imports nothing.
+A member is an object, or a text "module:name" that is imported on first use, so listing names imports nothing.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ OURS = "neuspring"
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Members of one kind, name -> member; ours come first, in their order.
+    """Members of one kind, name -> member; those of this package come first, in the order of their declaration.
 
-    Raises InputError where two packages bring one name, a package's member cannot be imported or is of another type, or there is no
-    such name (a KeyError too, so that it is a mapping).
+    Raises InputError if two packages register the same name, or if a member cannot be imported or has another type. An unknown
+    name raises `Unknown`, which is also a KeyError.
     """
 
     def __init__(self, kind: str, own: Mapping[str, T | str], type: type | tuple[type, ...] | str = object) -> None:
@@ -38,19 +38,19 @@ class Registry(Mapping[str, T], Generic[T]):
 
     @functools.cached_property
     def _foreign(self) -> dict[str, EntryPoint]:
-        found: dict[str, EntryPoint] = {}
+        points: dict[str, EntryPoint] = {}
         for point in entry_points(group=f"{OURS}.{self.kind}"):
             if _left_out(point):
                 continue
-            if point.name in self._own or ((other := found.get(point.name)) and other.value != point.value):
-                rule = f"two packages bring the {self.kind} member {point.name}"
-                raise InputError(f"package {_package(point)}", rule, point.value, "Uninstall one of them.")
-            found[point.name] = point
-        return dict(sorted(found.items()))
+            if point.name in self._own or ((other := points.get(point.name)) and other.value != point.value):
+                rule = f"only one package may register the {self.kind} member {point.name}"
+                raise InputError(f"package {_package(point)}", rule, point.value, "Uninstall one of the packages.")
+            points[point.name] = point
+        return dict(sorted(points.items()))
 
     @functools.cached_property
     def left_out(self) -> set[str]:
-        """Names that our own extensions would bring, whose folders were removed."""
+        """Names that belong to removed extensions of this package."""
         return {point.name for point in entry_points(group=f"{OURS}.{self.kind}") if _left_out(point)}
 
     def __getitem__(self, name: str) -> T:
@@ -65,7 +65,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return self._loaded[name]
 
     def _imported(self, point: EntryPoint) -> Any:
-        where, remedy = f"package {_package(point)}, {self.kind} {point.name}", "Repair or uninstall the package."
+        where, remedy = f"package {_package(point)}, {self.kind} {point.name}", "Fix or uninstall the package."
         try:
             member = point.load()
         except Exception as error:
@@ -85,7 +85,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return name in self._own or name in self._foreign
 
     def module_of(self, name: str) -> str:
-        """The module that a member is declared in, for digests of code; that of the registry's user for one given as an object."""
+        """The module in which a member is declared, for digests of code; empty for a member that is an object."""
         own = self._own.get(name) or getattr(self._foreign.get(name), "value", "")
         return own.partition(":")[0] if isinstance(own, str) else ""
 
@@ -98,8 +98,8 @@ class Unknown(InputError, KeyError):
 
 
 def modules(package: str, member: str = "{}") -> dict[str, str]:
-    """Each module of a package -> "module:name" of the member it declares; `member` has {} for the module's name."""
-    names = sorted(found.name for found in iter_modules(import_module(package).__path__) if not found.name.startswith("_"))
+    """Each module of a package -> "module:name" of the member that it declares; {} in `member` stands for the module's name."""
+    names = sorted(module.name for module in iter_modules(import_module(package).__path__) if not module.name.startswith("_"))
     return {name: f"{package}.{name}:{member.format(name)}" for name in names}
 
 
@@ -108,12 +108,12 @@ def _package(point: EntryPoint) -> str:
 
 
 def _resolved(value: Any) -> Any:
-    """What text "module:name" stands for, or the object itself."""
+    """The object that a text "module:name" names, or the value itself."""
     return resolve_name(value) if isinstance(value, str) else value
 
 
 def _left_out(point: EntryPoint) -> bool:
-    """One of our own extensions whose folder was removed: that is how a user leaves it out."""
+    """True for an extension of this package whose folder the user has removed to disable it."""
     module = point.value.partition(":")[0]
-    # To look for a module by its name would import its package.
+    # `find_spec` would import the package.
     return module.startswith(f"{OURS}.") and not (Path(__file__).parents[1] / f"{module.replace('.', '/')}.py").exists()

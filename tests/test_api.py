@@ -126,10 +126,10 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, capsys):
     first = losses(run.twin, 0.01, 1, checkpoint=checkpoint)
     for twin, rate in ((soft, 0.01), (run.twin, 0.05)):
         assert losses(twin, rate, 1, checkpoint=checkpoint) == losses(twin, rate, 1)
-        assert "made with other inputs or settings; the fit starts afresh" in capsys.readouterr().out
+        assert "made with other inputs or settings; the fit starts over" in capsys.readouterr().out
     losses(run.twin, 0.01, 1, checkpoint=checkpoint)
     assert losses(run.twin, 0.01, 2, checkpoint=checkpoint)[0] == first[0]
-    assert "continuing the fit after epoch 0" in capsys.readouterr().out
+    assert "resuming the fit after epoch 0" in capsys.readouterr().out
 
 
 def test_a_mass_changes_forces_and_no_motion(folder):

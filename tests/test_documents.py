@@ -4,6 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from snakemake.cli import get_argument_parser
 
@@ -13,8 +14,11 @@ ROOT = Path(__file__).parents[1]
 PLACES = ("", ".github", "config", "findings", "results", "results/published/bench", "tests/golden", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
 WRITTEN = [page for page in PAGES if page != ROOT / "config" / "README.md"]
-MOST_WORDS, ALL_WORDS = 5_000, 42_000
+MOST_WORDS, ALL_WORDS = 2_900, 31_000
 """Of a hand-written page, and of all of them."""
+NUMBERS = re.compile(r"<!-- numbers: (.+?) -->\n+(?:\|.*\n){2}((?:\|.*\n)+)")
+"""Files of the numbers of a table, and its lines below the head."""
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?![\w.])")
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PATH = re.compile(
     r"(?<![\w/.])((?:neuspring|workflow|config|tests|results/published)/[\w/.-]*\w\.(?:py|yaml|tsv|smk|csv|md|txt))\b"
@@ -80,3 +84,17 @@ def test_pages_are_short():
     words = {page.relative_to(ROOT).as_posix(): len(page.read_text().split()) for page in WRITTEN}
     assert max(words.values()) <= MOST_WORDS, words
     assert sum(words.values()) <= ALL_WORDS, words
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_numbers_of_tables_are_in_the_files_that_they_name(page):
+    """As they are shown, or rounded to the shown digits, in m or mm, as fractions or percent."""
+    absent = []
+    for names, lines in NUMBERS.findall(page.read_text().replace("−", "-")):
+        texts = [(ROOT / name).read_text().replace("−", "-") for name in names.split()]
+        known = np.abs([float(number) for text in texts for number in re.findall(r"\d+(?:\.\d+)?(?:e-?\d+)?", text)])
+        for number in NUMBER.findall(re.sub(r"`[^`]*`|\[[^\]]*\]\([^)]*\)|^\|[^|]*\|", "|", lines, flags=re.MULTILINE)):
+            close = 0.51 * 10.0 ** -len(number.partition(".")[2])
+            if not any((abs(factor * known - abs(float(number))) <= close).any() for factor in (1, 100, 1000)):
+                absent.append(number)
+    assert not absent

@@ -49,7 +49,7 @@ def test_an_unknown_name_is_told_with_those_that_there_are(packages):
 @pytest.mark.parametrize("other", ["math:pi", "math:tau"])
 def test_two_packages_cannot_bring_one_name(packages, other):
     packages += [entry("one", other)]
-    with pytest.raises(InputError, match="two packages bring the things member one"):
+    with pytest.raises(InputError, match="only one package may register the things member one"):
         list(Registry("things", {"one": 1.0}))
 
 

@@ -14,14 +14,14 @@ from neuspring.core.artifacts import Artifact, Trajectory
 from neuspring.core.checkpoint import Checkpoint, TrainingLoop
 
 DIVERGENCE_RADIUS = 10.0
-"""m from the origin. A state with a point beyond it counts as diverged: scenes are a meter or two wide."""
+"""Distance from the origin, m, beyond which a point counts as diverged; scenes are one or two meters wide."""
 Model = TypeVar("Model", bound=Artifact)
 TrainedModel = TypeVar("TrainedModel", bound=Artifact, covariant=True)
 
 
 @dataclass(frozen=True)
 class Trained(Generic[Model]):
-    """A trained model, and how it was trained."""
+    """A trained model and its training."""
 
     model: Model
     history: pd.DataFrame
@@ -29,11 +29,11 @@ class Trained(Generic[Model]):
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     failure: str = ""
-    """Reason why training ended early; the model is then the last usable one. Empty: it did not end early."""
+    """Reason why training ended early; the model is then the last usable one. Empty: training is complete."""
     attempts: int = 1
-    """1, plus one for every time that training continued from a checkpoint."""
+    """1, plus one for every time that training resumed from a checkpoint."""
     earlier_seconds: float = 0.0
-    """Wall time of the earlier attempts, up to their last checkpoint."""
+    """Wall time of the earlier attempts, up to their last checkpoint, s."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,15 @@ class Prediction:
     facts: dict[str, Any] = field(default_factory=dict)
     """Plain values for the record."""
     centers: np.ndarray | None = None
-    """[F, G, 3] m: centers of the model's own splats in every frame. None: it has none, and the platform's splats are skinned to
-    the trajectory."""
+    """Centers of the model's own splats in every frame [F, G, 3], m. None: the common splats follow the trajectory."""
 
 
 class TrainingStopped(ArithmeticError):
-    """Training cannot go on; says why."""
+    """Training cannot continue. The text is the reason."""
 
 
 class Training(Protocol[TrainedModel]):
-    """Methods that `run_epochs` asks of a training. `epoch` returns metrics; `facts` is given the number of complete epochs."""
+    """The interface of a training for `run_epochs`. `epoch` returns metrics; `facts` receives the number of complete epochs."""
 
     def epoch(self, number: int) -> dict[str, float]: ...
     def model(self) -> TrainedModel: ...
@@ -66,9 +65,9 @@ class Training(Protocol[TrainedModel]):
 def run_epochs(
     training: Training[Model], metrics: Sequence[str], epochs: int, partial: Path | None, key: str, failure: str = ""
 ) -> Trained[Model]:
-    """Train for so many epochs, or until `epoch` raises TrainingStopped, whose text becomes the failure.
+    """Train for `epochs` epochs, or until `epoch` raises TrainingStopped, whose text becomes the failure.
 
-    Continues from the file `partial` if it holds a checkpoint with the same key.
+    Resumes from the file `partial` if it contains a checkpoint with the same key.
     """
     loop = TrainingLoop("the training", "train", epochs, partial, key)
     if loop.restored:

@@ -1,5 +1,5 @@
 """The command line: `main` runs one command.
 
-A stage's command is in its own module (`neuspring.stages`). `data` and `results` hold the core's tools, a module `commands` of an
-extension its own; `main.COMMANDS` is the registry of all.
+The modules of `neuspring.stages` contain the commands of stages. `data`, `results` and `workflow` contain the other commands of the
+core, and the module `commands` of an extension its commands. `main.COMMANDS` is the registry of all commands except stages.
 """

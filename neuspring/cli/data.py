@@ -9,11 +9,11 @@ from neuspring.cli.options import Device, Positional, Settings, arg, read_settin
 from neuspring.core.errors import InputError
 
 DOUBTFUL_FRAMES_SHOWN = 5
-"""Number of doubtful frames that are named per camera."""
+"""Number of doubtful frames that are printed per camera."""
 
 
 def check_data(folder: Positional[Path], settings: Settings = "{}") -> int:
-    """Report how a data folder departs from the expected layout; exit status 2 where it cannot be used."""
+    """Report differences between a data folder and the expected layout; exit status 2 if the folder cannot be used."""
     from neuspring.intake.check import check_layout, render
 
     findings = check_layout(folder, read_settings(settings))
@@ -23,18 +23,20 @@ def check_data(folder: Positional[Path], settings: Settings = "{}") -> int:
 
 def mask(
     capture: Annotated[Positional[Path], arg(help="capture folder")],
-    marks: Annotated[Path | None, arg(help="marks of object and hands; marks.json of the capture by default")] = None,
-    backend: Annotated[Literal["marks", "sam2"], arg(help="sam2 needs its weights")] = "marks",
-    cameras: Annotated[tuple[str, ...], arg(help="all that have marks by default")] = (),
-    again: Annotated[bool, arg(help="also where marks, images and settings are unchanged")] = False,
+    marks: Annotated[Path | None, arg(help="annotations of object and hands; default: marks.json of the capture")] = None,
+    backend: Annotated[Literal["marks", "sam2"], arg(help="sam2 requires its weights")] = "marks",
+    cameras: Annotated[tuple[str, ...], arg(help="default: all cameras with annotations")] = (),
+    again: Annotated[bool, arg(help="remake masks even if annotations, images and settings are unchanged")] = False,
     masks: Annotated[
-        tuple[Path, ...], arg(help="instead of marks: per camera a folder of another tool's masks, 0 nothing, 1 object, 2 hands")
+        tuple[Path, ...], arg(help="import masks of another tool: one folder per camera; 0 background, 1 object, 2 hands")
     ] = (),
-    hands: Annotated[tuple[Path, ...], arg(help="per camera a folder of masks of the hands; all but 0 counts in both")] = (),
+    hands: Annotated[
+        tuple[Path, ...], arg(help="hand masks for --masks: one folder per camera; then every nonzero pixel counts in both")
+    ] = (),
     settings: Settings = "{}",
     device: Device = "auto",
 ) -> None:
-    """Marks on a few frames, or masks of other tools -> masks of object and hands in every frame of a capture."""
+    """Make masks of object and hands in every frame of a capture, from annotations or from masks of another tool."""
     from neuspring.checks.masks import mask_facts
     from neuspring.checks.perceived import look_at_masks
     from neuspring.core.text import Progress
@@ -47,11 +49,11 @@ def mask(
     if masks or hands:
         named = cameras or tuple(read.cameras)
         if len(masks) != len(named) or len(hands) not in (0, len(named)):
-            rule = f"a folder is required for each of the cameras {' '.join(named)}; --cameras chooses some"
+            rule = f"one folder is required per camera ({' '.join(named)}); --cameras selects cameras"
             raise InputError("--masks, --hands", rule, f"{len(masks)} and {len(hands)}")
-        for name, folder, held in zip(named, masks, hands or [None] * len(named), strict=True):
+        for name, folder, hand_folder in zip(named, masks, hands or [None] * len(named), strict=True):
             read.require_camera(name)
-            print(f"camera {name}: masks are in {store.import_masks(read, name, folder, held)}")
+            print(f"camera {name}: masks are in {store.import_masks(read, name, folder, hand_folder)}")
         print(f"next:\n  neuspring check-data {capture}")
         return
     marked = Marks.load(path)
@@ -61,31 +63,31 @@ def mask(
     for name in wanted or read.cameras:
         read.require_camera(name)
         if not marked.of(name):
-            raise InputError(f"{path}, cameras", f"camera {name} needs marks", sorted(marked.cameras))
+            raise InputError(f"{path}, cameras", f"camera {name} requires annotations", sorted(marked.cameras))
     made = store.MasksFile.of(read)
     for name in wanted:
         source = store.source_digest(read, name, marked.of(name), backend)
         if made.holds(read, name, source) and not again:
             doubts = made.cameras[name].doubt
-            told = "marks, images and settings are unchanged; its masks are kept"
+            outcome = "annotations, images and settings are unchanged; its masks are kept"
         else:
             carried = carrier.carry(read, name, marked.of(name), perception, device, Progress(f"camera {name}", 0).of)
             doubts = store.save_carried(read, name, carried, source, backend).doubt
             for finding in look_at_masks(read, name, carried.labels, mask_facts(read, name, carried.labels)):
                 print(finding)
-            told = f"masks are in {capture / 'mask' / name}"
-        print(f"camera {name}: {told}; look at {store.sheet_of(read, name)}")
+            outcome = f"masks are in {capture / 'mask' / name}"
+        print(f"camera {name}: {outcome}. Check {store.sheet_of(read, name)}")
         worst = sorted(range(len(doubts)), key=lambda frame: -doubts[frame])[:DOUBTFUL_FRAMES_SHOWN]
         print(f"camera {name}: most doubtful frames: " + ", ".join(f"{frame} ({doubts[frame]:.2f})" for frame in worst))
     if without := [name for name in read.cameras if not store.has_masks(read, [name])]:
-        print(f"cameras without masks: {', '.join(without)}; {read.folder / 'capture.json'} says masks: true when all have some")
+        print(f"cameras without masks: {', '.join(without)}. capture.json gets masks: true when all cameras have masks.")
 
 
 def compare_masks(
-    masks: Annotated[Positional[Path], arg(help="folder of masks, <frame>.png")],
-    truth: Annotated[Positional[Path], arg(help="folder of masks to compare with; its frames count")],
+    masks: Annotated[Positional[Path], arg(help="folder of masks <frame>.png")],
+    truth: Annotated[Positional[Path], arg(help="folder of true masks; its frames are compared")],
 ) -> None:
-    """Two folders of masks -> their overlap per frame."""
+    """Print the overlap of two folders of masks per frame."""
     from neuspring.perception.masks import compare, table
 
     print(table(compare(masks, truth)), end="")

@@ -1,8 +1,9 @@
-"""The command line, `neuspring`: every stage of the workflow by hand, and the tools around it.
+"""The command line, `neuspring`: every stage of the workflow as a command, and other tools.
 
-A command is a typed function: a stage, or a member of `COMMANDS`; tyro makes its options. Exit status: 0 done (a numerical failure
-is a recorded result), 2 bad input (only another input can help), 1 anything else. Only the module of the command that runs is
-imported, after the number of threads is set.
+A command is a typed function, either a stage or a member of `COMMANDS`; tyro derives its options.
+
+Exit status: 0 finished (a numerical failure is a recorded result), 2 invalid input (the same input fails again), 130 interrupted,
+1 other errors. `main` sets the number of threads before it imports the module of the command.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ COMMANDS: Registry[Callable[..., int | None]] = Registry(
     "commands",
     {name: f"neuspring.cli.{module}:{name.replace('-', '_')}" for module, names in _OURS.items() for name in names.split()},
 )
-"""Tools beside the stages. A dot in a member's name is a space of the command: `draw.film` is `neuspring draw film`."""
+"""Commands that are not stages. A dot in a name is a space in the command: `draw.film` is `neuspring draw film`."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OWN_THREADS = ("search",)
-"""Commands that share their work among --threads threads of their own: numerical libraries have one in each of them."""
+"""Commands that start --threads threads themselves, so numerical libraries use one thread in each."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except KeyboardInterrupt:
-        print("neuspring: stopped. Start it again; searches and fits go on from their checkpoints.", file=sys.stderr)
+        print("neuspring: interrupted. Rerun the same command; searches and fits resume from their checkpoints.", file=sys.stderr)
         return 128 + signal.SIGINT
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _threads(words: Sequence[str]) -> str:
-    """Threads of numerical libraries: those of --threads, before any parser knows it, as they read it when they are imported."""
+    """Number of threads of numerical libraries, from --threads. Libraries read it at import, before tyro parses the options."""
     if words[:1] and words[0] in OWN_THREADS:
         return "1"
     known = argparse.ArgumentParser(add_help=False, exit_on_error=False)
@@ -94,12 +95,12 @@ def _run(words: list[str]) -> int:
     close = [name for name in tools if name.startswith(f"{words[0]} ")] or difflib.get_close_matches(
         command, [*STAGES, *tools], n=1
     )
-    remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help names all."
-    raise InputError("command", "must be a stage or a tool", command, remedy)
+    remedy = f"Did you mean {' or '.join(close)}?" if close else "neuspring --help lists all commands."
+    raise InputError("command", "must be one of the commands", command, remedy)
 
 
 def _about(registry: Registry[Any], name: str) -> str:
-    """The first sentence of a command's docstring; of ours from the source, for to import all of them takes seconds."""
+    """First sentence of a command's docstring, read from the source if possible, because importing all commands takes seconds."""
     file = Path(__file__).parents[2] / f"{registry.module_of(name).replace('.', '/')}.py"
     start = f"def {name.replace('-', '_').replace('.', '_')}("
     text = file.read_text(encoding="utf-8").partition(start)[2].split('"""')[1] if file.exists() else registry[name].__doc__
@@ -109,7 +110,9 @@ def _about(registry: Registry[Any], name: str) -> str:
 def _overview() -> str:
     from neuspring.stages import STAGES
 
-    stages, tools = ([f"  {name.replace('.', ' '):<17} {_about(each, name)}" for name in each] for each in (STAGES, COMMANDS))
+    stages, tools = (
+        [f"  {name.replace('.', ' '):<17} {_about(registry, name)}" for name in registry] for registry in (STAGES, COMMANDS)
+    )
     usage = "usage: neuspring COMMAND [options]; neuspring COMMAND --help\n"
-    about = "Spring-mass twins of deformable objects from RGBD video.\n\nStages of the workflow, each by hand:"
-    return "\n".join([usage, about, *stages, "\nTools:", *tools])
+    about = "NeuSpring makes spring-mass twins of deformable objects from RGBD videos.\n\nStages of the workflow:"
+    return "\n".join([usage, about, *stages, "\nOther commands:", *tools])

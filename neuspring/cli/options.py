@@ -1,4 +1,4 @@
-"""Types of options that commands share."""
+"""Types of options that several commands use."""
 
 from __future__ import annotations
 

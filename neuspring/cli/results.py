@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
     from neuspring.scores.table import ScoreTable
 
-OnDisk = Annotated[tuple[str, ...], arg(help="all on disk by default")]
-Names = Annotated[tuple[str, ...], arg(help="those of the settings, else all on disk, by default")]
-Scores = Annotated[Path | None, arg(help="instead of run records: a scores.csv that tables wrote, on any machine")]
-LeftOut = Annotated[str, arg(help="JSON: methods and the scenarios to which they do not apply, with reasons")]
-RowTable = Annotated[Path, arg(help="this table of the configuration")]
-ExtraRows = Annotated[tuple[Path, ...], arg(help="files with more rows of these tables")]
+OnDisk = Annotated[tuple[str, ...], arg(help="default: all in the results folder")]
+Names = Annotated[tuple[str, ...], arg(help="default: from the settings, else all in the results folder")]
+Scores = Annotated[Path | None, arg(help="read this scores.csv of `neuspring tables` instead of run records")]
+LeftOut = Annotated[str, arg(help="JSON: method -> scenarios to which it does not apply -> reason")]
+RowTable = Annotated[Path, arg(help="YAML table of the configuration")]
+ExtraRows = Annotated[tuple[Path, ...], arg(help="files with more entries of the tables")]
 Folder = Annotated[Path, arg(help="folder to write to")]
-Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins were rolled out on other recordings")]
+Transfers = Annotated[tuple[str, ...], arg(help="scenarios whose twins also predict other recordings (transfer)")]
 Tables = Annotated[str, arg(help="folder of tables in the results folder")]
 
 
@@ -40,16 +40,18 @@ def tables(
     methods: OnDisk = (),
     seeds: tuple[int, ...] = (),
     transfers: Transfers = (),
-    baseline: Annotated[str | None, arg(help="method that others are compared with; the first by default")] = None,
-    objects: Annotated[Literal["scenario", "category"], arg(help="what intervals of ratios are over")] = "scenario",
-    aims: Annotated[str, arg(help="JSON: ratios that are aimed at (config/README.md, aims)")] = "[]",
+    baseline: Annotated[str | None, arg(help="method that all methods are compared with; default: the first")] = None,
+    objects: Annotated[
+        Literal["scenario", "category"], arg(help="units over which the intervals of ratios are computed")
+    ] = "scenario",
+    aims: Annotated[str, arg(help="JSON list of target ratios (key aims in config/README.md)")] = "[]",
     scores: Scores = None,
     left_out: LeftOut = "{}",
     method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
-    brief: Annotated[bool, arg(help="print the verdict alone")] = False,
+    brief: Annotated[bool, arg(help="print only the verdict")] = False,
 ) -> None:
-    """Run records -> the long table of scores (scores.csv, runs.csv), and the benchmark's tables."""
+    """Write the tables of a benchmark: scores.csv, runs.csv and summary.md."""
     from neuspring.config.settings import Aim
     from neuspring.core.job_records import asked
     from neuspring.report import tables
@@ -58,19 +60,19 @@ def tables(
     from neuspring.scores.metrics import require_metrics
     from neuspring.scores.table import as_asked, collect
 
-    wanted = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
-    require_metrics(wanted)
+    targets = tuple(parse(Aim, row, "--aims") for row in json_value("--aims", aims, list))
+    require_metrics(targets)
     absent = _read_left_out(left_out)
-    common: Any = {"objects": objects, "aims": wanted, "names": tables.shown_names(method_table, extra_rows)}
+    common: Any = {"objects": objects, "aims": targets, "names": tables.shown_names(method_table, extra_rows)}
     if scores:
-        found = _read_scores(scores, scenarios, methods, seeds, left_out)
+        table = _read_scores(scores, scenarios, methods, seeds, left_out)
     else:
-        there = traces(results)
-        scenarios, methods, seeds = scenarios or tuple(there[0]), methods or tuple(there[1]), seeds or tuple(there[2])
+        present = traces(results)
+        scenarios, methods, seeds = scenarios or tuple(present[0]), methods or tuple(present[1]), seeds or tuple(present[2])
         if not (scenarios and methods and seeds):
-            raise InputError(results, "a results folder with runs is required", "none", "Run the workflow first, or name another.")
-        found = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), asked(results))
-    numbers = tables.Compared(table=found, baseline=baseline or found.methods[0], **common)
+            raise InputError(results, "must contain runs", None, "Run the workflow first, or pass another folder with --results.")
+        table = as_asked(collect(results, scenarios, methods, seeds, absent, transfers), asked(results))
+    numbers = tables.Compared(table=table, baseline=baseline or table.methods[0], **common)
     text = tables.write(numbers, output)
     print(markdown(tables.verdict(numbers)) if brief else text)
     print(f"Tables: {output / 'summary.md'}")
@@ -79,14 +81,14 @@ def tables(
 def _read_scores(path: Path, scenarios: Sequence[str], methods: Sequence[str], seeds: Sequence[int], left_out: str) -> ScoreTable:
     from neuspring.scores.table import read_scores
 
-    found = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
-    return replace(found, left_out=_read_left_out(left_out))
+    table = read_scores(path).named(scenario=scenarios, method=methods, seed=seeds)
+    return replace(table, left_out=_read_left_out(left_out))
 
 
 def perception_table(
-    scenarios: Annotated[str, arg(help="names and categories, as JSON")], output: Path, results: Results = Path("results")
+    scenarios: Annotated[str, arg(help="JSON: names and categories")], output: Path, results: Results = Path("results")
 ) -> None:
-    """Errors of perception, per category."""
+    """Write a table of the errors of perception per category."""
     from neuspring.report import perception
 
     named = [(name, str(category)) for name, category in json_value("--scenarios", scenarios).items()]
@@ -94,46 +96,44 @@ def perception_table(
 
 
 def study(
-    study: Annotated[str, arg(help="row of the study table")],
+    study: Annotated[str, arg(help="name in the study table")],
     output: Folder,
     results: Results = Path("results"),
     tables: Tables = "tables",
     scores: Scores = None,
     table: RowTable = Path("config/studies.yaml"),
     extra_rows: ExtraRows = (),
-    scenarios: Annotated[tuple[str, ...], arg(help="a part of the scores")] = (),
+    scenarios: Annotated[tuple[str, ...], arg(help="default: all in the scores")] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
     left_out: LeftOut = "{}",
 ) -> None:
-    """The scores.csv that `tables` wrote -> one of the paper's tables, beside the paper's values."""
+    """Write a table of the paper with the paper's values and ours, from the scores.csv of `neuspring tables`."""
     from neuspring.report.study import write_study
 
     studies = read_studies(table, extra_rows)
     if study not in studies:
-        raise InputError("study", f"must be a row of {table}", study, f"Known: {', '.join(studies)}")
-    one = studies[study]
-    if scores and one.kind:
-        remedy = "Leave out --scores and name --results."
-        raise InputError(f"study {study}", f"a study of the kind {one.kind} needs a results folder", "scores alone", remedy)
-    found = _read_scores(scores or results / tables / "scores.csv", scenarios, methods, seeds, left_out)
-    print(write_study(study, one, found, results, output))
+        raise InputError("study", f"must be an entry of {table}", study, f"Choose from {', '.join(studies)}.")
+    chosen = studies[study]
+    if scores and chosen.kind:
+        rule = f"a study of the kind {chosen.kind} requires a results folder"
+        raise InputError(f"study {study}", rule, "--scores", "Pass --results instead.")
+    score_table = _read_scores(scores or results / tables / "scores.csv", scenarios, methods, seeds, left_out)
+    print(write_study(study, chosen, score_table, results, output))
 
 
 def explain(
-    what: Annotated[
-        Positional[str], arg(help="names of a method, scenario, seed, task or metric, with / between: neuspring/future/TE")
-    ],
+    what: Annotated[Positional[str], arg(help="methods, scenarios, seeds, tasks or metrics, separated by /: neuspring/future/TE")],
     results: Results = Path("results"),
     tables: Tables = "tables",
 ) -> None:
-    """A number -> the rows of scores.csv behind it, and the records of their runs."""
+    """Print the rows of scores.csv behind a number, and the records of their runs."""
     from neuspring.core.table import lay_out
     from neuspring.report.tables import behind
     from neuspring.scores.table import read_scores
 
-    found = behind(read_scores(results / tables / "scores.csv"), what.split("/"), results)
-    print(f"{found.caption}\n\n{lay_out(found, 'text')}")
+    rows = behind(read_scores(results / tables / "scores.csv"), what.split("/"), results)
+    print(f"{rows.caption}\n\n{lay_out(rows, 'text')}")
 
 
 def report(
@@ -143,18 +143,20 @@ def report(
     methods: Names = (),
     seeds: tuple[int, ...] = (),
     transfers: Transfers = (),
-    baseline: Annotated[str | None, arg(help="method that others are compared with")] = None,
-    shown: Annotated[tuple[str, ...], arg(help="methods to draw; six at most by default")] = (),
+    baseline: Annotated[
+        str | None, arg(help="method that all methods are compared with; default: from the settings, else the first")
+    ] = None,
+    shown: Annotated[tuple[str, ...], arg(help="methods with curves, images and videos; default: at most six")] = (),
     table: RowTable = Path("config/studies.yaml"),
     method_table: RowTable = Path("config/methods.yaml"),
     extra_rows: ExtraRows = (),
     tables: Tables = "tables",
-    megabytes: Annotated[float, arg(help="size that pictures and videos may fill")] = 25.0,
-    video_megabytes: Annotated[float, arg(help="part of it for videos; the others are linked")] = 8.0,
+    megabytes: Annotated[float, arg(help="maximum size of the page, MB; files that do not fit are linked")] = 25.0,
+    video_megabytes: Annotated[float, arg(help="maximum size of the embedded videos, MB")] = 8.0,
     left_out: LeftOut = "{}",
     settings: Settings = "{}",
 ) -> None:
-    """Results folder -> one self-contained HTML file."""
+    """Write the report of a results folder, one self-contained HTML file."""
     from neuspring.report import page
     from neuspring.report.tables import shown_names
 
@@ -177,15 +179,17 @@ def report(
 
 
 def _read_left_out(text: str) -> dict[str, dict[str, str]]:
-    """Method -> scenarios to which it does not apply, and why, from JSON text. Raises InputError."""
+    """Parse JSON: method -> scenarios to which it does not apply -> reason. Raises InputError."""
     values: dict[str, dict[str, str]] = json_value("--left-out", text)
-    if not all(isinstance(why, dict) and all(isinstance(reason, str) for reason in why.values()) for why in values.values()):
-        raise InputError("--left-out", "must map methods to scenarios with reasons", text)
+    if not all(
+        isinstance(reasons, dict) and all(isinstance(reason, str) for reason in reasons.values()) for reasons in values.values()
+    ):
+        raise InputError("--left-out", "must map methods to scenarios, and scenarios to reasons", text)
     return values
 
 
 def sync(results: Results = Path("results"), settings: Settings = "{}") -> int:
-    """Send to MLflow what is missing there; 1 where something could not be sent."""
+    """Log all runs that MLflow does not contain yet; exit status 1 if a run could not be logged."""
     from neuspring.experiments.tracking import log
 
     outcomes = log.sync(results, read_settings(settings).tracking, progress=print)
@@ -199,25 +203,27 @@ def ui(results: Results = Path("results"), settings: Settings = "{}", host: str 
     from neuspring.experiments.tracking.store import ENVIRONMENT, default_uri, page
 
     tracking = read_settings(settings).tracking
-    uri, (place, empty) = tracking.uri or default_uri(results), page(results, tracking)
+    uri, (address, empty) = tracking.uri or default_uri(results), page(results, tracking)
     if empty and tracking.uri is None:
         sync(results, tracking, print)
     if uri.startswith("http"):
-        print(f"The tracking server is at {uri}/{place}")
+        print(f"The tracking server is at {uri}/{address}")
         return
     try:
         socket.create_server((host, port)).close()
     except OSError as error:
-        raise InputError("--port", "must be free", f"{port} ({error.strerror})", f"Give another: --port {port + 1}.") from error
+        raise InputError(
+            "--port", "must be free", f"{port} ({error.strerror})", f"Choose another port: --port {port + 1}."
+        ) from error
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", host, "--port", str(port)]
-    # Each of MLflow's four processes imports all of it, and opens the index anew for the page that asks it first.
+    # By default MLflow starts four processes, and each of them imports all of MLflow and opens the index again.
     command += ["--workers", "1"]
     server = subprocess.Popen(command, env=ENVIRONMENT | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"} | os.environ)
     with contextlib.suppress(KeyboardInterrupt):
         while server.poll() is None:
             with contextlib.suppress(OSError):
                 socket.create_connection((host, port), timeout=1).close()
-                print(f"MLflow UI: http://{host}:{port}/{place} (stop with Ctrl-C)", flush=True)
+                print(f"MLflow UI: http://{host}:{port}/{address} (stop with Ctrl-C)", flush=True)
                 break
             time.sleep(0.5)
         server.wait()

@@ -1,14 +1,14 @@
-"""Every setting: its meaning, unit, range and default, as frozen dataclasses that refuse unknown keys.
+"""All settings with meaning, unit, range and default, as frozen dataclasses that reject unknown keys.
 
-    settings                       the whole configuration (`Config`), GPUs, a part of it for one step
-    simulation, search, twin       integration; the zero-order search; losses, field, fit
+    settings                       the complete configuration (`Config`), GPUs, the part of it that a step reads
+    simulation, search, twin       integration; the search; losses, field, fit
     data, perception, images       sources; raw video to observations; splats and their scores
-    extensions, tuning             sections that packages bring; sweeps over settings
+    extensions, tuning             sections of packages; sweeps over settings
     rows                           rows of the scenario, method and search tables
-    parse                          the types of settings, YAML to settings and back
-    page                           writes config/README.md from all of these
+    parse                          YAML to settings and back
 
-Nothing here imports torch, Warp or MLflow, because the workflow reads the configuration before any job exists.
+`tests/config/page.py` writes config/README.md from these modules. They import neither torch, Warp nor MLflow, because the
+workflow reads the configuration before any job exists.
 """
 
 from neuspring.config.data import Toy

@@ -1,4 +1,4 @@
-"""Settings of the sources of data that this package makes or samples itself."""
+"""Settings of the data sources that this package simulates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neuspring.core.section import SettingsSection
 
 @dataclass(frozen=True, kw_only=True)
 class Toy(SettingsSection):
-    """Analytic scenes simulated by the float64 reference, with known stiffness."""
+    """Analytic scenes with known stiffness, simulated by the float64 reference."""
 
     frames: Annotated[int, Field(ge=5)] = 60
-    """Frames per scene; the first 70 % are for training."""
+    """Frames per scene; the first 70 % are training frames."""

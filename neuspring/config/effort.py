@@ -1,4 +1,4 @@
-"""The dial `effort`: the sizes that decide how long a benchmark takes, all turned together."""
+"""The setting `effort`: named sets of the sizes that determine how long a benchmark takes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ EFFORT_SIZES: dict[str, tuple[Any, Any, Any]] = {
     "images.appearance.degree": (0, 0, 3),
     **{f"{path}.{key}": values for path, kind in EXTENSION_SETTINGS.items() for key, values in kind.efforts.items()},
 }
-"""Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and of
-the released code, the defaults of all keys but `synthetic.size`. Pictures of the first camera are scored, as in the paper."""
+"""Key -> its value at each effort. quick: `make demo`. normal: the published synthetic benchmark. paper: sizes of the paper and
+the released code, which are also the defaults of all keys except `synthetic.size`."""
 
 
 def sizes(effort: str) -> dict[str, Any]:

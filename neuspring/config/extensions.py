@@ -1,4 +1,4 @@
-"""Sections of settings that packages bring, by an entry point of the group `neuspring.settings`.
+"""Sections of settings that packages register by entry points of the group `neuspring.settings`.
 
 The name of an entry point is the dotted path of its section:
 
@@ -6,8 +6,8 @@ The name of an entry point is the dotted path of its section:
     "baselines.mine" = "my_package.settings:Mine"
     "fit.mine" = "my_package.settings:MyFit"
 
-`Mine` is a frozen dataclass above `SettingsSection`. Code of the package reads its section, typed, by
-`config.baselines.section(Mine)`. A section may be added to each dataclass that `with_extensions` decorates.
+`Mine` is a frozen dataclass that inherits `SettingsSection`. The package reads its section with `config.baselines.section(Mine)`.
+Sections may be added to every dataclass that `with_extensions` decorates.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EXTENSION_SETTINGS = Registry[type[SettingsSection]]("settings", {}, type)
 
 
 def with_extensions(path: str) -> Callable[[type[T]], type[T]]:
-    """Decorate a section, below its `dataclass`: it gets the sections that packages bring at `path` (empty: the top level)."""
+    """Decorator, below `dataclass`: add the sections that packages register at `path` (empty: the top level)."""
 
     def extended(kind: type[T]) -> type[T]:
         for name in EXTENSION_SETTINGS:
@@ -41,7 +41,7 @@ def with_extensions(path: str) -> Callable[[type[T]], type[T]]:
 @dataclass(frozen=True, kw_only=True)
 @with_extensions("baselines")
 class Baselines(SettingsSection):
-    """The models of the baselines; a method's own `settings` go on top."""
+    """Models of the baselines; a method's own `settings` override them."""
 
     if TYPE_CHECKING:
 

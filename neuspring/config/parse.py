@@ -1,6 +1,6 @@
-"""Plain YAML values to settings and back.
+"""Convert plain YAML values to settings and back.
 
-Unknown keys raise, values are never cast, every problem is listed with its path.
+Unknown keys are errors, values are never cast, and errors list every problem with its path.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
-    """Build the dataclass `kind` from plain values, strictly. Raises InputError listing every problem with its path."""
+    """Build the dataclass `kind` from plain values, strictly. Raises InputError, which lists every problem with its path."""
     values = kind.completed(values) if issubclass(kind, SettingsSection) and isinstance(values, Mapping) else values
     try:
         result: T = _adapter(kind).validate_json(json.dumps(values), strict=True)  # type: ignore[arg-type]
@@ -39,15 +39,15 @@ def parse(kind: type[T], values: Mapping[str, Any], where: str) -> T:
 
 @functools.cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Building one takes longer than a thousand uses of it."""
+    """Cached: building an adapter takes longer than a thousand uses."""
     return TypeAdapter(kind)
 
 
 def _describe(problem: Any, kind: type) -> str:
-    place = [part for part in problem["loc"] if not str(part).startswith("constrained")]
-    path, value = ".".join(map(str, place)) or "(top level)", problem["input"]
+    keys = [part for part in problem["loc"] if not str(part).startswith("constrained")]
+    path, value = ".".join(map(str, keys)) or "(top level)", problem["input"]
     if problem["type"] == "unexpected_keyword_argument":
-        near = difflib.get_close_matches(str(place[-1]), _keys(kind, place[:-1]), n=1)
+        near = difflib.get_close_matches(str(keys[-1]), _keys(kind, keys[:-1]), n=1)
         return f"{path}: unknown key" + (f" (did you mean {near[0]}?)" if near else "")
     if problem["type"] == "missing":
         return f"{path}: required, but missing"
@@ -58,7 +58,7 @@ def _describe(problem: Any, kind: type) -> str:
 
 
 def _keys(kind: Any, path: Iterable[Any]) -> list[str]:
-    """The keys of the section at a path of a dataclass."""
+    """The keys of the section at this path in a dataclass."""
     for name in path:
         hint = get_type_hints(kind).get(name)
         kind = next((part for part in (hint, *parts(hint)) if dataclasses.is_dataclass(part)), kind)
@@ -66,20 +66,20 @@ def _keys(kind: Any, path: Iterable[Any]) -> list[str]:
 
 
 def parts(hint: Any) -> Iterator[Any]:
-    """All types inside a type: the members of a union, the values of a mapping."""
+    """Yield all types inside a type: the members of a union, the values of a mapping."""
     for part in get_args(hint):
         yield part
         yield from parts(part)
 
 
 def plain(settings: Any) -> dict[str, Any]:
-    """The settings as plain YAML/JSON values (lists, not tuples)."""
+    """Settings as plain YAML/JSON values (lists, not tuples)."""
     result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
     return result
 
 
 def read_text(path: Path) -> str:
-    """A file's text. Raises InputError."""
+    """Read a file as UTF-8 text. Raises InputError."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -87,13 +87,13 @@ def read_text(path: Path) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML mapping from a file. Raises InputError."""
+    """Read a YAML mapping from a file. Raises InputError."""
     try:
         values = yaml.safe_load(read_text(path))
     except yaml.YAMLError as error:
         raise InputError(path, "this file must be YAML", str(error).replace("\n", " ")) from error
     if not isinstance(values, dict):
-        raise InputError(path, "this file must hold a YAML mapping", type(values).__name__)
+        raise InputError(path, "this file must contain a YAML mapping", type(values).__name__)
     return values
 
 
@@ -102,10 +102,10 @@ EXTRA_ROWS = {"method": "methods", "search": "searches", "study": "studies"}
 
 
 def read_rows(kind: type[T], path: Path, what: str, extra: Iterable[Path] = ()) -> dict[str, T]:
-    """A table of a YAML file, then the rows of the same kind in the files `extra`: name -> row. Raises InputError.
+    """Read a table from a YAML file, and rows of the same kind from the files `extra`: name -> row. Raises InputError.
 
-    A row that `extends` another row of any of these files has that row's values below its own. A row with `each: [2, 3]` defines
-    one row per value, which replaces {each} in its name and its texts.
+    A row that `extends` another row, in any of these files, inherits its values. A row with `each: [2, 3]` defines one row per
+    value, which replaces {each} in the name and the texts.
     """
     table: dict[str, Any] = {}
     files: dict[str, Path] = {}
@@ -115,10 +115,10 @@ def read_rows(kind: type[T], path: Path, what: str, extra: Iterable[Path] = ()) 
             if values is not None and not (isinstance(values, list) and values):
                 raise InputError(f"{file}, {what} {name}", "each: a list of at least one value is required", values)
             for value in [None] if values is None else values:
-                made = str(name).replace("{each}", str(value))
-                if made in table:
-                    raise InputError(f"{file}, {what} {made}", "names of rows must differ", f"a row of {files[made]}", "Rename it.")
-                table[made], files[made] = row if value is None else _filled(row, str(value)), file
+                key = str(name).replace("{each}", str(value))
+                if key in table:
+                    raise InputError(f"{file}, {what} {key}", "names of rows must differ", f"a row of {files[key]}", "Rename it.")
+                table[key], files[key] = row if value is None else _filled(row, str(value)), file
     return {name: parse(kind, _extended(table, name, files, what, ()), f"{files[name]}, {what} {name}") for name in table}
 
 
@@ -127,24 +127,24 @@ def _extra_rows(path: Path) -> dict[str, Any]:
     sections = read_yaml(path)
     for name, rows in sections.items():
         if name not in EXTRA_ROWS.values() or not isinstance(rows, dict):
-            raise InputError(path, f"this file must have mappings of rows under {', '.join(EXTRA_ROWS.values())}", name)
+            raise InputError(path, f"this file must contain mappings of rows under {', '.join(EXTRA_ROWS.values())}", name)
     return sections
 
 
 def _extended(table: Mapping[str, Any], name: str, files: Mapping[str, Path], what: str, below: tuple[str, ...]) -> Any:
     if name not in table or name in below:
-        rule = "extends: a row of this table is required, which does not extend this one"
+        rule = "extends: another row of this table is required, without a cycle"
         raise InputError(f"{files[below[-1]]}, {what} {below[-1]}", rule, name, f"Known: {', '.join(table)}.")
     row = table[name]
     if not isinstance(row, dict) or "extends" not in row:
         return row
     if not isinstance(row["extends"], str):
         raise InputError(f"{files[name]}, {what} {name}", "extends: the name of a row is required", row["extends"])
-    whole = copy.deepcopy(_extended(table, row["extends"], files, what, (*below, name)))
-    # A name belongs to one row.
-    whole.pop("title", None)
-    merge(whole, {key: value for key, value in row.items() if key != "extends"})
-    return whole
+    values = copy.deepcopy(_extended(table, row["extends"], files, what, (*below, name)))
+    # A title belongs to one row.
+    values.pop("title", None)
+    merge(values, {key: value for key, value in row.items() if key != "extends"})
+    return values
 
 
 def _filled(row: Any, value: str) -> Any:
@@ -154,31 +154,31 @@ def _filled(row: Any, value: str) -> Any:
 
 
 def of_command_line(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of `--config` as YAML has them: Snakemake leaves true, false and null as text, inside mappings numbers too.
+    """Convert values of `--config` to YAML types: Snakemake passes true, false and null as text, and in mappings also numbers.
 
-    Lists stay as they are: their entries may be names, such as 0.
+    Lists do not change, because their entries may be names, such as 0.
     """
-    spelled = ("true", "false", "null")
-    return {key: typed(value) if isinstance(value, Mapping) or value in spelled else value for key, value in values.items()}
+    words = ("true", "false", "null")
+    return {key: typed(value) if isinstance(value, Mapping) or value in words else value for key, value in values.items()}
 
 
 def typed(value: Any) -> Any:
-    """A text as YAML has it, or a mapping or list of such."""
+    """Convert a text, or all texts in a mapping or list, to its YAML type."""
     if isinstance(value, Mapping):
-        return {key: typed(each) for key, each in value.items()}
+        return {key: typed(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [typed(each) for each in value]
+        return [typed(item) for item in value]
     if isinstance(value, str):
         try:
-            read = yaml.safe_load(value)
+            parsed = yaml.safe_load(value)
         except yaml.YAMLError:
             return value
-        return read if isinstance(read, bool | int | float | None) else value
+        return parsed if isinstance(parsed, bool | int | float | None) else value
     return value
 
 
 def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
-    """Put `overlay` on top of `base`, in place: mappings merge, everything else replaces."""
+    """Override `base` with `overlay`, in place: mappings merge, all other values are replaced."""
     for key, value in overlay.items():
         below = base.get(key)
         if isinstance(value, Mapping) and isinstance(below, dict):
@@ -188,12 +188,12 @@ def merge(base: dict[str, Any], overlay: Mapping[str, Any]) -> None:
 
 
 def nested(path: str, value: Any) -> dict[str, Any]:
-    """A value under a dotted key, nested as in a configuration file."""
+    """The value under a dotted key, nested as in a configuration file."""
     return functools.reduce(lambda inner, name: {name: inner}, reversed(path.split(".")), value)
 
 
 def json_value(option: str, text: str, kind: type = dict) -> Any:
-    """The JSON object (or list) given with an option. Raises InputError."""
+    """Parse the JSON object (or list) of an option. Raises InputError."""
     try:
         values = json.loads(text)
     except json.JSONDecodeError as error:

@@ -1,4 +1,4 @@
-"""Settings of the zero-order search: its variables, their ranges and scales."""
+"""Settings of the search: its variables with ranges and scales, and its budget."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ LENGTHS = ("object_radius", "controller_radius", "contact_distance")
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of the search, which normalizes [low, high] to [0, 1] on its scale."""
+    """A variable of the search; its scale maps [low, high] to [0, 1]."""
 
     __pydantic_config__ = STRICT
     low: Finite
     high: Finite
     start: Finite
-    """Start of the search, where a fixed variable stays."""
+    """Start of the search; the value of a fixed variable."""
     scale: Literal["linear", "log"] = "linear"
 
     def normalized(self, value: float) -> float:
-        """The place of a value in [low, high]."""
+        """Map a value from [low, high] to [0, 1]."""
         if self.scale == "log":
             return float(np.log(value / self.low) / np.log(self.high / self.low))
         return (value - self.low) / (self.high - self.low)
@@ -41,49 +41,49 @@ class Variable:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchVariables(SettingsSection):
-    """Variables of the search: lowest and highest value, start, and scale (linear or log). A setting names what differs."""
+    """Variables of the search: low, high, start, and scale (linear or log). Omitted entries keep their defaults."""
 
     stiffness: Variable = Variable(10.0, 1e5, 3e3, "log")
     """Stiffness Y of the springs, N."""
     object_radius: Variable = Variable(1.2, 5.0, 2.5)
-    """Radius within which object nodes are joined, in units of `lengths`."""
+    """Connection radius of nodes, in units of `lengths`."""
     object_neighbors: Variable = Variable(10.0, 50.0, 30.0)
-    """Most neighbors of an object node, itself included."""
+    """Maximum number of neighbors of a node, including itself."""
     controller_radius: Variable = Variable(0.5, 5.0, 2.0)
-    """Radius within which a controller is joined to object nodes, m; with `lengths: spacing` how far it goes beyond the smallest
-    distance between a controller and a node, in spacings."""
+    """Connection radius of controllers, m; with `lengths: spacing`, the excess over the smallest controller-node distance, in
+    spacings."""
     controller_neighbors: Variable = Variable(10.0, 80.0, 50.0)
-    """Most object nodes that a controller is joined to."""
+    """Maximum number of nodes connected to a controller."""
     ground_elasticity: Variable = Variable(0.0, 1.0, 0.5)
-    """Restitution on the ground."""
+    """Restitution at the ground."""
     ground_friction: Variable = Variable(0.0, 2.0, 0.3)
-    """Friction on the ground."""
+    """Coefficient of friction at the ground."""
     contact_elasticity: Variable = Variable(0.0, 1.0, 0.7)
     """Restitution between nodes."""
     contact_friction: Variable = Variable(0.0, 2.0, 0.3)
-    """Friction between nodes."""
+    """Coefficient of friction between nodes."""
     contact_distance: Variable = Variable(0.5, 3.0, 1.0)
     """Distance at which nodes collide, in units of `lengths`."""
     drag: Variable = Variable(0.05, 50.0, 3.0, "log")
-    """Velocity decay, 1/s."""
+    """Exponential decay rate of velocity, 1/s."""
     dashpot: Variable = Variable(0.1, 500.0, 20.0, "log")
     """Damping along springs, N s/m."""
 
     @model_validator(mode="before")
     @classmethod
     def _over_defaults(cls, given: Any) -> Any:
-        """The given values on top of the defaults of each variable."""
+        """Override the defaults of each variable with the given values."""
         if not isinstance(given, dict):
             return given
         defaults = dataclasses.asdict(cls())
-        return {name: defaults.get(name, {}) | own if isinstance(own, dict) else own for name, own in given.items()}
+        return {name: defaults.get(name, {}) | value if isinstance(value, dict) else value for name, value in given.items()}
 
     def __post_init__(self) -> None:
         for name in (spec.name for spec in dataclasses.fields(self)):
             low, high = getattr(self, name).low, getattr(self, name).high
             if not 0 <= low < high:
                 raise ValueError(f"{name}: 0 <= low < high is required, received [{low}, {high}]")
-        # An object node counts itself among its neighbors.
+        # A node counts itself as a neighbor.
         for name, least in (("object_neighbors", 2), ("controller_neighbors", 1)):
             if getattr(self, name).low < least:
                 raise ValueError(f"{name}: at least {least} is required, received {getattr(self, name).low}")
@@ -96,43 +96,41 @@ VARIABLES = tuple(spec.name for spec in dataclasses.fields(SearchVariables))
 
 @dataclass(frozen=True, kw_only=True)
 class Search(SettingsSection):
-    """Zero-order stage: CMA-ES over homogeneous material and topology."""
+    """CMA-ES over topology and homogeneous material."""
 
     rollouts: Count = 220
-    """Budget in candidate rollouts, the same for every method that is compared. The last generation may be cut short."""
+    """Budget in candidate rollouts, equal for all compared methods. The last generation may be incomplete."""
     tied_rollouts: Annotated[int, Field(ge=0)] = 0
-    """Rollouts, out of the budget, in which all regions share their values; afterwards each region is free around the best
-    candidate."""
+    """Rollouts of the budget in which all regions share their values; afterwards each region varies around the best candidate."""
     isolated_nodes: Literal["repair", "allow"] = "repair"
-    """Treatment of nodes and parts that no spring joins to the rest: join them, a part along its seam (repair), or leave them, as
-    released (allow)."""
+    """Nodes and parts without a spring to the rest: connect them (repair), or leave them (allow, as released). A part is
+    connected along its seam."""
     lengths: Literal["spacing", "meter"] = "spacing"
-    """Unit of radii and of contact_distance in `variables`: the distance between neighboring nodes in the rest shape,
-    or meters, as released."""
+    """Unit of radii and contact_distance in `variables`: the node spacing of the rest shape, or meters (as released)."""
     fixed: tuple[str, ...] = ()
-    """Variables that keep their start and are not searched; the start may then lie outside the range."""
+    """Variables that keep their start value, which may be outside the range."""
     hands: Literal["hold", "push", "auto"] = "hold"
-    """Action of hands: their springs pull and push (hold, as released), only push, or what costs less (auto). push: they act only
-    while they are shorter than at rest, and rest at `contact_distance` or, where a node was nearer in frame 0, there. auto: the
-    first generation is judged in both ways, out of the budget, and the way of its best candidate is kept; hands push only if that
-    also costs less than 0.9 of a body that stays."""
+    """Controller springs pull and push (hold, as released), only push, or take the cheaper mode (auto). push: springs act only
+    while they are shorter than their rest length, which is `contact_distance`, or the distance in frame 0 if that is smaller.
+    auto: the first generation is evaluated in both modes, within the budget, and the mode of its best candidate is kept; push
+    also requires a cost below 0.9 of that of a static object."""
     controller_rest: Literal["rest_shape", "first_frame"] = "rest_shape"
-    """Shape in which springs of controllers have no force: the body's rest shape, or frame 0, as a hand takes hold of a body that
-    is bent already."""
+    """Shape in which controller springs have no force: the rest shape, or frame 0. Use first_frame if the object is already bent
+    when it is grasped."""
     variables: SearchVariables = field(default_factory=SearchVariables)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.fixed if name not in VARIABLES]
         if unknown or len(set(self.fixed)) != len(self.fixed) or len(VARIABLES) - len(self.fixed) < 2:
-            rule = f"different ones of {', '.join(VARIABLES)} are required, two of which stay free"
+            rule = f"entries must be different variables ({', '.join(VARIABLES)}), and at least two must stay free"
             raise ValueError(f"fixed: {rule}, received {list(self.fixed)}")
         for name in VARIABLES:
             if name in self.fixed:
                 continue
-            it = getattr(self.variables, name)
-            if not it.low <= it.start <= it.high:
-                raise ValueError(f"variables.{name}: start = {it.start} lies outside [{it.low}, {it.high}]")
-            if it.scale == "log" and it.low <= 0:
-                raise ValueError(f"variables.{name}: scale log needs a positive low, received {it.low}")
+            spec = getattr(self.variables, name)
+            if not spec.low <= spec.start <= spec.high:
+                raise ValueError(f"variables.{name}: start must be in [{spec.low}, {spec.high}], received {spec.start}")
+            if spec.scale == "log" and spec.low <= 0:
+                raise ValueError(f"variables.{name}: scale log requires a positive low, received {spec.low}")
         if self.tied_rollouts >= self.rollouts:
             raise ValueError(f"tied_rollouts must be below rollouts ({self.rollouts}), received {self.tied_rollouts}")

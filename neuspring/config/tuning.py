@@ -1,4 +1,4 @@
-"""Settings of a sweep over settings."""
+"""Settings of a sweep: the method, its varied settings, and the number of trials."""
 
 from __future__ import annotations
 
@@ -16,61 +16,61 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class Dimension(SettingsSection):
-    """Values of one setting: numbers between `low` and `high`, or `choices`."""
+    """Values of one setting: a range from `low` to `high`, or `choices`."""
 
     low: Number | None = None
-    """Smallest value, in the setting's unit; a whole number where the setting is one."""
+    """Smallest value, in the setting's unit; an integer for an integer setting."""
     high: Number | None = None
     """Largest value."""
     log: bool = False
-    """Logarithmic scale of the draws."""
+    """Sample on a logarithmic scale."""
     step: Number | None = None
-    """Distance between two values, from `low` on; null: 1 for whole numbers, otherwise continuous."""
+    """Step from `low`; null: 1 for integers, otherwise continuous."""
     choices: tuple[Any, ...] = ()
-    """Values to choose from instead of a range: any that the setting may have."""
+    """List of values instead of a range."""
 
     def __post_init__(self) -> None:
         if self.choices:
             if (self.low, self.high, self.log, self.step) != (None, None, False, None):
-                raise ValueError("either choices or low and high (with log or step) are required, received both")
-            if len(self.choices) < 2 or any(value in self.choices[:place] for place, value in enumerate(self.choices)):
-                raise ValueError(f"choices: at least two, all different, are required, received {list(self.choices)}")
+                raise ValueError("either choices, or low and high (with log or step) are required, received both")
+            if len(self.choices) < 2 or any(value in self.choices[:index] for index, value in enumerate(self.choices)):
+                raise ValueError(f"choices: at least two different values are required, received {list(self.choices)}")
             return
         if self.low is None or self.high is None:
             raise ValueError("low and high, or choices, are required")
         wrong_step = self.step is not None and (self.log or not 0 < self.step <= self.high - self.low)
         if not self.low < self.high or (self.log and self.low <= 0) or wrong_step:
-            rule = "low < high is required, for log low > 0 and no step, otherwise 0 < step <= high - low"
+            rule = "low < high is required; with log also low > 0 and no step, otherwise 0 < step <= high - low"
             raise ValueError(f"{rule}, received {self}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(SettingsSection):
-    """A sweep: which settings of one method are varied, and how trials are spent. Test frames are never read.
+    """A sweep over settings of one method. It never reads future frames.
 
-    The mean loss over the configuration's scenarios is minimized.
+    Optuna minimizes the mean loss over the configuration's scenarios.
     """
 
     study: Annotated[Name, StringConstraints(max_length=60)]
-    """Name of the sweep and of its folder in `<results>/tune`. A sweep keeps its method, space, settings and data for good."""
+    """Name of the sweep and of its folder in `<results>/tune`. Method, space, settings and data of a sweep cannot change."""
     method: Name
-    """Row of the method table that is varied. Trial 0 is the row as it is, with its own settings and those of its search row."""
+    """Method whose settings vary. Trial 0 uses the settings of the method and of its search."""
     space: dict[str, Dimension]
     """Setting -> values, see [tune.space](#tunespace). Keys are dotted paths of `simulation`, `losses`, `search`, `fit`,
     `released_quirks`, and `clusters`, the number of regions of the method's search."""
     trials: Count = 40
-    """Number of trials over all workers: finished, pruned and failed ones. With a larger number the sweep continues."""
+    """Total number of finished, pruned and failed trials. Increase it to continue a sweep."""
     workers: Count = 1
     """Number of jobs that share the sweep."""
     storage: str | None = None
-    """PostgreSQL URI, for workers on several machines. It must hold no password: libpq reads PGPASSWORD or ~/.pgpass. null: SQLite
-    in the sweep's folder, for workers of one machine."""
+    """PostgreSQL URI for workers on several machines; null: SQLite in the sweep's folder. The URI must not contain a password:
+    libpq reads PGPASSWORD or ~/.pgpass. SQLite works only for workers on one machine."""
 
     def __post_init__(self) -> None:
         if not self.space:
             raise ValueError("space: at least one setting is required")
         if self.storage:
             if not re.fullmatch(r"postgresql(\+\w+)?://\S+", self.storage):
-                rule = "must be postgresql://HOST/DATABASE, or null: SQLite in the sweep's folder, for workers of one machine"
+                rule = "must be postgresql://HOST/DATABASE, or null (SQLite, for workers on one machine)"
                 raise ValueError(f"storage: {rule}; received {self.storage!r}")
             refuse_password("storage", self.storage, "PGPASSWORD or ~/.pgpass")

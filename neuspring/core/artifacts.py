@@ -1,9 +1,8 @@
-"""The nouns that cross a rule boundary: frozen, validated dataclasses, each saved to one file.
+"""The data types that stages exchange: frozen, validated dataclasses, each saved to one file.
 
 Every array is declared with its shape, dtype and unit (`array(...)`). Symbolic dimensions (T frames, N nodes, S springs,
-...) must agree within one artifact. Files are `.npz` without pickle: the arrays, plus one JSON text under `meta` that
-holds the kind, the format version and the plain fields. Writes go to a temporary file that is renamed when complete, so
-a killed job never leaves a half file that looks whole.
+...) must agree within one artifact. Files are `.npz` without pickle: the arrays, and one JSON text under `meta` with
+the kind, the format version and the plain fields. Writes are atomic, so a killed job leaves no partial file.
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from neuspring.core.files import DamagedFile, read_npz, write_npz
 from neuspring.registry import Registry
 
 FORMAT_VERSION = 2
-"""Version of the files of all artifacts; files of another version are refused."""
+"""Version of all artifact files; `load` rejects other versions."""
 Up = Literal["+z", "-z"]
 InitialVelocity = Literal["rest", "observed", "before"]
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
-"""Names become folder names and command-line words: no separators, spaces or shell characters."""
+"""Allowed names. They become folder names and command-line words, so separators, spaces and shell characters are excluded."""
 OMITTED = {"empty": "omitted"}
-"""Metadata of a field that files do not have where it is empty."""
+"""Metadata of a field that is not written while it is empty."""
 NO_REST_SHAPE = np.zeros((0, 3))
-"""No rest shape of its own: frame 0 is the rest shape."""
+"""The empty rest shape: frame 0 is the rest shape."""
 
 
 def up_sign(up: str) -> float:
@@ -53,8 +52,8 @@ def array(
 ) -> Any:
     """Declare an array field: comma-separated dimensions (letters are symbols, digits are fixed), dtype, unit, meaning.
 
-    `sign` is what all entries must be: "positive" or "not negative". An optional one is empty where it is not given; an omitted one
-    is optional, and not in the file where it is empty.
+    `sign` restricts all entries: "positive" or "not negative". An `optional` array is empty by default. An `omitted` array is
+    optional, and is not written while it is empty.
     """
     sizes = tuple(shape.split(","))
     metadata = {"shape": sizes, "dtype": np.dtype(dtype), "unit": unit, "doc": doc, "nan": nan, "omitted": omitted, "sign": sign}
@@ -65,7 +64,7 @@ def array(
 
 
 def number(unit: str, doc: str, **default: float) -> Any:
-    """Declare a number: unit, meaning, and a `default` where it may be left out. One of 0 is not in the file where it is 0."""
+    """Declare a number: unit, meaning, and a `default` if it is optional. A default of 0 is not written to files."""
     metadata = {"unit": unit, "doc": doc} | (OMITTED if default.get("default") == 0 else {})
     return field(metadata=metadata, **default)  # type: ignore[call-overload]
 
@@ -117,12 +116,12 @@ class Artifact:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that a file of it would hold."""
+        """SHA-256 of everything that `save` writes."""
         arrays: dict[str, np.ndarray] = {}
-        whole = hashlib.sha256(json.dumps(self._flatten(arrays, ""), sort_keys=True, default=dataclasses.asdict).encode())
+        digest = hashlib.sha256(json.dumps(self._flatten(arrays, ""), sort_keys=True, default=dataclasses.asdict).encode())
         for name in sorted(arrays):
-            whole.update(name.encode() + arrays[name].tobytes())
-        return whole.hexdigest()
+            digest.update(name.encode() + arrays[name].tobytes())
+        return digest.hexdigest()
 
     def save(self, path: Path) -> None:
         """Write this artifact to `path` (.npz) atomically."""
@@ -140,7 +139,7 @@ class Artifact:
                 if value.size or not spec.metadata["omitted"]:
                     arrays[prefix + spec.name] = value
             elif isinstance(value, Artifact):
-                # Its arrays stand beside those of this one.
+                # A nested artifact's arrays go to the same file, with its field name as a prefix.
                 part = value._flatten(arrays, f"{prefix}{spec.name}.")
                 plain[spec.name] = part | {"kind": value.kind} if isinstance(value, BodyData) else part
             elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -155,24 +154,24 @@ class Artifact:
         """Read an artifact of this kind from `path`. Raises InputError if the file is missing, damaged or of another kind."""
         path = Path(path)
         if not path.is_file():
-            raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that makes it first.")
+            raise InputError(path, f"this file must be of kind {cls.kind}", "no such file", "Run the step that writes it first.")
         try:
             arrays, meta = read_npz(path)
         except DamagedFile as error:
             raise InputError(
-                path, f"this file must be readable, of kind {cls.kind}", str(error), "Delete it and re-run its step."
+                path, f"this file must be readable and of kind {cls.kind}", str(error), "Delete it and rerun its step."
             ) from error
-        if (found := (meta.get("kind"), meta.get("format"))) != (cls.kind, FORMAT_VERSION):
+        if (received := (meta.get("kind"), meta.get("format"))) != (cls.kind, FORMAT_VERSION):
             rule = f"this file must be of kind {cls.kind}, format {FORMAT_VERSION}"
-            raise InputError(path, rule, found, "Re-run the step that made it.")
+            raise InputError(path, rule, received, "Rerun the step that writes it.")
         try:
             return cls._build(arrays, meta["fields"], "")
         except (KeyError, TypeError) as error:
             raise InputError(
                 path,
-                f"this file must hold every field of kind {cls.kind}, and no other",
+                f"this file must contain every field of kind {cls.kind} and no others",
                 f"{type(error).__name__}: {error}",
-                "Of another version? Run the step that makes it again.",
+                "It may be from another version: rerun the step that writes it.",
             ) from error
 
     @classmethod
@@ -183,14 +182,14 @@ class Artifact:
             raise TypeError(f"unknown fields {sorted(unknown)}")
         for spec in dataclasses.fields(cls):
             is_array = "shape" in spec.metadata
-            held: dict[str, Any] = arrays if is_array else plain
+            stored: dict[str, Any] = arrays if is_array else plain
             name = prefix + spec.name if is_array else spec.name
             has_default = spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
-            if name not in held and has_default:
-                continue  # left out where it is empty
-            kind, value = hints[spec.name], held[name]
+            if name not in stored and has_default:
+                continue  # empty fields are not written
+            kind, value = hints[spec.name], stored[name]
             if isinstance(kind, UnionType):
-                # An artifact or none; a file that has it has an artifact.
+                # `Artifact | None`: a field that is written is never None.
                 kind = get_args(kind)[0]
             if kind is BodyData:
                 kind, value = BODY_DATA[value["kind"]], {key: of for key, of in value.items() if key != "kind"}
@@ -205,13 +204,13 @@ class Artifact:
 
 
 def kept(spec: dataclasses.Field[Any], value: object) -> bool:
-    """True where a file has the field; an empty one may be left out."""
+    """True if the field is written to files; an empty field with `OMITTED` is not."""
     return bool(value) or not OMITTED.items() <= spec.metadata.items()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Artifact):
-    """Source of a capture, its frames and their split, and the world around it.
+    """A capture's source, frames, split and world (up direction, ground).
 
     Training frames are [0, train_end), future frames [train_end, frame_count).
     """
@@ -219,7 +218,7 @@ class Scenario(Artifact):
     kind: ClassVar[str] = "scenario"
     name: str
     source: str
-    """The kind of its data, a name of `SOURCES` (scenes/sources.py)."""
+    """The kind of data, a name of `SOURCES` (scenes/sources.py)."""
     category: str
     frame_count: int
     train_end: int
@@ -230,9 +229,9 @@ class Scenario(Artifact):
     self_collision: bool = False
     ground: bool = True
     mass: float | None = field(default=None, metadata=OMITTED)
-    """Mass of the object, kg, to which exports are scaled; None: not known. Motion depends on forces per mass alone."""
+    """Mass of the object, kg, to which exports scale; None: unknown. Motion depends only on forces per mass."""
     provenance: dict[str, str] = field(default_factory=dict)
-    """Files with digests, and options, that the reader used, as text."""
+    """Input files with digests, and options of the reader, as text."""
 
     @property
     def up_sign(self) -> float:
@@ -247,7 +246,7 @@ class Scenario(Artifact):
                 f"scenario {self.name}, split",
                 f"1 < train_end <= frame_count = {self.frame_count} is required",
                 f"train_end = {self.train_end}",
-                "Correct the split; at least one frame after frame 0 must be for training.",
+                "Correct the split: at least one frame after frame 0 must be a training frame.",
             )
         if not (np.isfinite(self.frame_rate) and self.frame_rate > 0):
             raise InputError(
@@ -263,9 +262,9 @@ class Scenario(Artifact):
 class ImageObservations(Artifact):
     """Observations of one calibrated camera without depth: the object in training frames, the hands in all frames.
 
-    A capture that brings hands in space (intake/points.py) has none here: H = 0, and `hand_of` is empty.
+    If the capture contains controllers in 3D (intake/points.py), H = 0 and `hand_of` is empty.
 
-    Pixel centers lie at whole coordinates, x right, y down (data/capture.py).
+    Pixel centers are at integer coordinates, x right, y down (data/capture.py).
     """
 
     kind: ClassVar[str] = "image_observations"
@@ -275,17 +274,17 @@ class ImageObservations(Artifact):
     camera_to_world: np.ndarray = array("4,4", np.float64, "m", "pose")
     pixel_size: float
     """Width of a pixel at the object in frame 0, m."""
-    pixels: np.ndarray = array("T,No,2", np.float32, "px", "where tracked points of the object are seen; zeros elsewhere")
-    visible: np.ndarray = array("T,No", np.bool_, "1", "whether they are seen; never in future frames")
-    inside: np.ndarray = array("E,P,2", np.float32, "px", "on the object, in training frames; NaN: fewer", nan=True)
-    outside: np.ndarray = array("E,h,w", np.float32, "px", "distance from object and hands of cells of the image; 0 within")
+    pixels: np.ndarray = array("T,No,2", np.float32, "px", "image positions of tracked object points; zeros where not visible")
+    visible: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is visible; false in future frames")
+    inside: np.ndarray = array("E,P,2", np.float32, "px", "points on the object, training frames; padded with NaN", nan=True)
+    outside: np.ndarray = array("E,h,w", np.float32, "px", "distance of each image cell from object and hands; 0 inside them")
     cell: int
     """Side of a cell, px; the center of cell (row i, column j) is ((j + 1/2) cell - 1/2, (i + 1/2) cell - 1/2)."""
-    hand_of: np.ndarray = array("C", np.int32, "1", "the hand of each controller")
-    hand_centers: np.ndarray = array("T,H,2", np.float32, "px", "where the grip of each hand is in the image")
-    hand_angles: np.ndarray = array("T,H", np.float32, "rad", "turn of each hand in the image since frame 0, from x to y")
-    hand_sizes: np.ndarray = array("T,H", np.float32, "1", "apparent size of each hand over that of frame 0")
-    marked: np.ndarray = array("T,K,2", np.float32, "px", "points marked by hand, for scoring only; NaN: not marked", nan=True)
+    hand_of: np.ndarray = array("C", np.int32, "1", "index of the hand of each controller")
+    hand_centers: np.ndarray = array("T,H,2", np.float32, "px", "image position of each hand's grasp")
+    hand_angles: np.ndarray = array("T,H", np.float32, "rad", "rotation of each hand in the image since frame 0, from x to y")
+    hand_sizes: np.ndarray = array("T,H", np.float32, "1", "apparent size of each hand, relative to frame 0")
+    marked: np.ndarray = array("T,K,2", np.float32, "px", "annotated points, for scoring only; NaN: not annotated", nan=True)
 
     @property
     def hands(self) -> int:
@@ -295,22 +294,22 @@ class ImageObservations(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(Artifact):
-    """Observations of a capture: tracked object points, the hands, and the structure of the object in frame 0.
+    """Observations of a capture: tracked object points, controllers, and the object's nodes in frame 0.
 
-    The canonical node order is [object_points[0] | surface_points | interior_points]; the first No + Ns nodes are "surface".
+    The canonical node order is [object_points[0] | surface_points | interior_points]; the first No + Ns are surface nodes.
     """
 
     kind: ClassVar[str] = "observations"
     scenario: Scenario
-    object_points: np.ndarray = array("T,No,3", np.float32, "m", "tracked points; zeros where invisible")
-    object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is seen in each frame")
-    object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: the motion from frame t to t+1 may be trusted")
+    object_points: np.ndarray = array("T,No,3", np.float32, "m", "tracked points; zeros where not visible")
+    object_visibility: np.ndarray = array("T,No", np.bool_, "1", "whether each tracked point is visible in each frame")
+    object_motion_valid: np.ndarray = array("T,No", np.bool_, "1", "row t: whether the motion from frame t to t+1 is reliable")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "points that move the object (hands, grippers)")
-    """A controller that first holds later has, in frame 0, the place of the body that it will hold: its springs are made there."""
+    """A controller that grasps later starts at its future contact point, because its springs are built in frame 0."""
     controller_valid: np.ndarray = array(
-        "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: all do in all frames", omitted=True
+        "T,C", np.bool_, "1", "whether each controller holds the object in each frame; empty: always", omitted=True
     )
-    controller_hand: np.ndarray = array("C", np.int32, "1", "the hand of each controller; empty: not known", omitted=True)
+    controller_hand: np.ndarray = array("C", np.int32, "1", "index of the hand of each controller; empty: unknown", omitted=True)
     surface_points: np.ndarray = array("Ns,3", np.float32, "m", "further surface nodes of frame 0")
     interior_points: np.ndarray = array("Ni,3", np.float32, "m", "interior nodes of frame 0")
     tracks: np.ndarray = array("T,K,3", np.float32, "m", "annotated tracks for scoring only; NaN where not annotated", nan=True)
@@ -321,19 +320,19 @@ class Observations(Artifact):
         "V",
         np.int32,
         "1",
-        "center line of a long thin body: nodes, or N + c for controller c, in order; empty: not known",
+        "center line of a long thin object: node indices, or N + c for controller c, in order; empty: unknown",
         omitted=True,
     )
     velocity_before: np.ndarray = array(
         "P,3",
         np.float32,
         "m/s",
-        "of tracked points, then controllers, in frame 0, from the sample before it; empty: none",
+        "velocity of tracked points, then controllers, in frame 0, from the sample before it; empty: unknown",
         omitted=True,
     )
     image: ImageObservations | None = field(default=None, metadata=OMITTED)
-    """Observations of a camera without depth. Then object points are known in frame 0 alone, and hands that were seen move in a
-    plane (perception/color_hands.py)."""
+    """Observations of a camera without depth. With them, object points are known only in frame 0, and hands seen by the camera
+    move in a plane (extensions/color_alone/hands.py)."""
 
     def check(self) -> None:
         name = f"observations of {self.scenario.name}"
@@ -343,11 +342,11 @@ class Observations(Artifact):
         if points == 0:
             raise InputError(name, "at least one tracked object point is required", "none")
         if self.controller_points.shape[1] == 0:
-            raise InputError(name, "at least one controller point is required", "none", "Without a hand nothing moves the object.")
+            raise InputError(name, "at least one controller point is required", "none", "Without controllers, nothing moves.")
         if not self.object_visibility[0].all():
             count = int((~self.object_visibility[0]).sum())
             raise InputError(
-                name, "every tracked point must be visible in frame 0, where every rollout starts", f"{count} of {points} are not"
+                name, "every tracked point must be visible in frame 0, where rollouts start", f"{count} of {points} are not"
             )
         hands = self.controller_points.shape[1]
         _require_rest_shape(name, self.rest_shape, len(self.nodes) + hands)
@@ -355,10 +354,10 @@ class Observations(Artifact):
         if self.line.size and not (
             len(set(self.line.tolist())) == len(self.line) > 2 and 0 <= self.line.min() <= self.line.max() < total
         ):
-            rule = f"at least 3 different indices in [0, {total})"
+            rule = f"must contain at least 3 different indices in [0, {total})"
             raise InputError(f"{name}.line", rule, self.line.tolist())
         if len(self.velocity_before) not in (0, points + hands):
-            rule = f"one velocity per tracked point and controller ({points + hands}), or none"
+            rule = f"must contain one velocity per tracked point and controller ({points + hands}), or none"
             raise InputError(f"{name}.velocity_before", rule, len(self.velocity_before))
         if self.image is not None:
             sizes = (*self.image.visible.shape, len(self.image.hand_of) if self.image.hands else hands)
@@ -368,16 +367,16 @@ class Observations(Artifact):
 
     @property
     def nodes(self) -> np.ndarray:
-        """Nodes of frame 0 [N, 3], meters."""
+        """Nodes of frame 0 [N, 3], m."""
         return np.concatenate([self.object_points[0], self.surface_points, self.interior_points])
 
     @property
     def canonical(self) -> np.ndarray:
-        """Nodes, then controllers [N + C, 3], m, in the shape that topology, regions and the field are defined on."""
+        """Nodes, then controllers [N + C, 3], m, in the shape in which topology, regions and field are defined."""
         return canonical_shape(self.nodes, self.controller_points[0], self.rest_shape)
 
     def on_line(self, positions: np.ndarray) -> np.ndarray:
-        """The center line [F, V, 3], m, of nodes at positions [F, N, 3], with the controllers of the first F frames."""
+        """The center line [F, V, 3], m, for node positions [F, N, 3] and the controllers of the first F frames."""
         joined: np.ndarray = np.concatenate([positions, self.controller_points[: len(positions)]], axis=1)[:, self.line]
         return joined
 
@@ -388,48 +387,50 @@ class Observations(Artifact):
 
 
 def canonical_shape(nodes: np.ndarray, controllers: np.ndarray, rest_shape: np.ndarray) -> np.ndarray:
-    """The rest shape [N + C, 3], m, or, where it is empty, nodes [N, 3] and controllers [C, 3] of frame 0."""
+    """The rest shape [N + C, 3], m; if it is empty, nodes [N, 3] and controllers [C, 3] of frame 0."""
     return rest_shape if len(rest_shape) else np.concatenate([nodes, controllers])
 
 
 def _require_rest_shape(name: str, rest_shape: np.ndarray, points: int) -> None:
     if len(rest_shape) not in (0, points):
-        raise InputError(f"{name}.rest_shape", f"one position per node and controller ({points}), or none", len(rest_shape))
+        raise InputError(
+            f"{name}.rest_shape", f"must contain one position per node and controller ({points}), or none", len(rest_shape)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Topology(Artifact):
-    """The spring graph. Spring end points index nodes; an index i >= N means controller i - N."""
+    """The spring graph. Spring end points are node indices; an index i >= N means controller i - N."""
 
     kind: ClassVar[str] = "topology"
     nodes: np.ndarray = array("N,3", np.float32, "m", "positions of frame 0")
     controllers: np.ndarray = array("C,3", np.float32, "m", "controller positions of frame 0")
     springs: np.ndarray = array("S,2", np.int32, "1", "end points; object springs first, then controller springs")
     rest_lengths: np.ndarray = array("S", np.float32, "m", "lengths without force")
-    labels: np.ndarray = array("N", np.int32, "1", "cluster of each node; all zero when the topology is uniform")
+    labels: np.ndarray = array("N", np.int32, "1", "region of each node; all zero in a uniform topology")
     rest_shape: np.ndarray = array(
         "R,3", np.float32, "m", "unloaded positions of nodes, then controllers; empty: frame 0 is the rest shape", optional=True
     )
     pushes: np.ndarray = array(
-        "S", np.bool_, "1", "springs of controllers that act only while they are shorter than at rest; empty: none", omitted=True
+        "S", np.bool_, "1", "controller springs that act only while shorter than their rest length; empty: none", omitted=True
     )
     controller_rest: str = "rest_shape"
-    """Shape in which the springs of controllers have no force: rest_shape, or first_frame, whatever the rest shape is."""
+    """Shape in which controller springs have no force: rest_shape or first_frame."""
 
     def check(self) -> None:
         nodes, total = len(self.nodes), len(self.nodes) + len(self.controllers)
         _require_rest_shape("topology", self.rest_shape, total)
         if len(self.springs) and (self.springs.min() < 0 or self.springs.max() >= total):
             raise InputError(
-                "topology.springs", f"indices must lie in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]"
+                "topology.springs", f"indices must be in [0, {total})", f"[{self.springs.min()}, {self.springs.max()}]"
             )
         of_controller = (self.springs >= nodes).any(axis=1)
         if (np.diff(of_controller.astype(np.int8)) < 0).any():
             raise InputError("topology.springs", "object springs must come before controller springs")
         if (self.springs >= nodes).all(axis=1).any():
-            raise InputError("topology.springs", "a spring may not join two controllers")
+            raise InputError("topology.springs", "a spring must not connect two controllers")
         if self.pushes.size and (self.pushes & ~of_controller).any():
-            raise InputError("topology.pushes", "only springs of controllers may push alone", "an object spring")
+            raise InputError("topology.pushes", "only controller springs may be push-only", "an object spring")
         if self.controller_rest not in ("rest_shape", "first_frame"):
             raise InputError("topology.controller_rest", "must be 'rest_shape' or 'first_frame'", repr(self.controller_rest))
         short = np.flatnonzero(~(self.rest_lengths > 0))
@@ -443,24 +444,24 @@ class Topology(Artifact):
 
     @property
     def canonical(self) -> np.ndarray:
-        """Nodes, then controllers [N + C, 3], m, in the shape that rest lengths and the field are defined on."""
+        """Nodes, then controllers [N + C, 3], m, in the shape in which rest lengths and field are defined."""
         return canonical_shape(self.nodes, self.controllers, self.rest_shape)
 
     @property
     def object_spring_count(self) -> int:
-        """Number of springs that join two object nodes; they come first."""
+        """Number of springs that connect two nodes; they come first."""
         return int(np.count_nonzero((self.springs < len(self.nodes)).all(axis=1)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material(Artifact):
-    """Physical parameters. Nodes have 1 kg each, as in the released simulator, or masses of their own; forces scale with them."""
+    """Physical parameters. Each node has 1 kg, as in the released simulator, or its value of `mass`; forces scale with mass."""
 
     kind: ClassVar[str] = "material"
     stiffness: np.ndarray = array("S", np.float32, "N", "Y in f = Y (l / l0 - 1): force per unit strain", sign="not negative")
     dashpot: np.ndarray = array("S", np.float32, "N s/m", "damping along the spring", sign="not negative")
     drag: float = number("1/s", "exponential decay of velocity")
-    ground_elasticity: float = number("1", "part of the normal speed that is left")
+    ground_elasticity: float = number("1", "restitution: fraction of the normal speed after contact with the ground")
     ground_friction: float = number("1", "Coulomb's coefficient")
     contact_elasticity: float = number("1", "as ground_elasticity, between nodes")
     contact_friction: float = number("1", "as ground_friction, between nodes")
@@ -477,12 +478,12 @@ class Material(Artifact):
 
 
 SCALARS = tuple(spec.name for spec in dataclasses.fields(Material) if "shape" not in spec.metadata)
-"""Fields of the material that are one number."""
+"""Scalar fields of the material."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """Integration of a twin: everything that a rollout needs besides topology, material and the motion of controllers."""
+    """Integration settings of a twin: what a rollout needs besides topology, material and controller motion."""
 
     frame_time: float
     """Simulated time per frame, s. The substep is frame_time / substeps."""
@@ -493,11 +494,12 @@ class Simulation:
     ground: bool = True
     self_collision: bool = False
     collision_capacity: int = 500
-    """Candidate partners kept per node and frame; more are reported, never written."""
+    """Collision candidates kept per node and frame; a rollout counts the others as overflow."""
     controller_velocity: bool = False
-    """Give controllers their finite-difference velocity in the dashpots. The released simulator uses zero."""
+    """Whether dashpots use the finite-difference velocity of controllers. The released simulator uses zero."""
     initial_velocity: InitialVelocity = "rest"
-    """Velocity at the start of a rollout: rest (none), as in the released simulator, or the one observed in the first frames."""
+    """Velocity in frame 0: zero (rest), as in the released simulator; from the first frames (observed); from the sample before
+    frame 0 (before)."""
 
     def __post_init__(self) -> None:
         if not (0 < self.frame_time < np.inf and self.substeps >= 1 and self.collision_capacity >= 1 and np.isfinite(self.gravity)):
@@ -519,14 +521,14 @@ class Simulation:
 
 @dataclass(frozen=True, kw_only=True)
 class BodyData(Artifact):
-    """What a kind of body other than the lattice keeps in a twin; a package brings its class under its `kind` (`BODY_DATA`)."""
+    """Data that a body other than the lattice stores in a twin; packages register subclasses in `BODY_DATA`."""
 
     def check_with(self, topology: Topology) -> None:
         """Raise InputError if this contradicts the nodes, controllers and springs of the twin."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """Sizes worth keeping in a record."""
+        """Sizes for the record of a stage."""
         return {}
 
 
@@ -536,14 +538,14 @@ BODY_DATA: Registry[type[BodyData]] = Registry("body_data", {}, type)
 
 @dataclass(frozen=True, kw_only=True)
 class Twin(Artifact):
-    """Topology + Material + Simulation: enough to roll out anywhere. With a body other than the lattice also its own data."""
+    """Topology, material and simulation settings: everything that a rollout needs except the controllers' motion."""
 
     kind: ClassVar[str] = "twin"
     topology: Topology
     material: Material
     simulation: Simulation
     body: BodyData | None = field(default=None, metadata=OMITTED)
-    """Data of the body; None: a lattice of springs. Then springs may be those of controllers alone."""
+    """Data of a body other than the lattice; None: a lattice. With such data, all springs may be controller springs."""
 
     def check(self) -> None:
         springs, values = len(self.topology.springs), len(self.material.stiffness)
@@ -557,7 +559,7 @@ class Twin(Artifact):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Sizes worth keeping in a record."""
+        """Sizes for the record of a stage."""
         return (self.body.counts if self.body else {}) | {
             "nodes": len(self.topology.nodes),
             "springs": len(self.topology.springs),
@@ -568,16 +570,16 @@ class Twin(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory(Artifact):
-    """Predicted node positions. A rollout that diverges is a named result: it keeps the frames before `diverged_frame`."""
+    """Predicted node positions. If the rollout diverges, the trajectory contains the frames before `diverged_frame`."""
 
     kind: ClassVar[str] = "trajectory"
     positions: np.ndarray = array("F,N,3", np.float32, "m", "positions at the end of each frame; frame 0 is the rest state")
     frame_count: int
-    """Frames asked for; F is smaller only when the rollout diverged."""
+    """Number of requested frames; F is smaller only if the rollout diverged."""
     diverged_frame: int | None = None
     reason: str = ""
     collision_overflow: int = 0
-    """Collision candidates that did not fit the list, summed over frames."""
+    """Number of collision candidates beyond the list's capacity, summed over frames."""
 
     def check(self) -> None:
         frames = len(self.positions)
@@ -588,7 +590,7 @@ class Trajectory(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatCenters(Artifact):
-    """Centers of the splats that a method's own model moves; their other properties are those of frame 0."""
+    """Splat centers predicted by a method's own model; all other splat properties are those of frame 0."""
 
     kind: ClassVar[str] = "splat_centers"
     positions: np.ndarray = array("F,G,3", np.float32, "m", "center of each splat at the end of each frame")

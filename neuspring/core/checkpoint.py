@@ -1,8 +1,7 @@
-"""Checkpoints from which a killed stage continues, and what every resumable training shares: its epochs with a history, and Adam's
-state as arrays.
+"""Checkpoints of killed stages, the epoch loop of resumable trainings, and Adam's state as arrays.
 
-A checkpoint is named arrays and plain values, valid for one key, which says what it was made with: inputs, settings, kind of
-device, code. One with another key is left alone.
+A checkpoint contains named arrays, plain values and a key: the digest of inputs, settings, kind of device and code. A stage
+ignores a checkpoint with another key.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ if TYPE_CHECKING:
 
 
 CHECKPOINT_FORMAT = 3
-"""Raise it where what checkpoints hold changes: those of another version are refused by name."""
+"""Format version. Increase it when the content of checkpoints changes; other versions are rejected."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """State from which a stage continues after a kill."""
+    """State from which a killed stage resumes."""
 
     arrays: Mapping[str, Mapping[str, np.ndarray]]
-    """Arrays by group and name. A group's name has no dot. Of a loaded checkpoint, a group without arrays is empty."""
+    """Group -> name -> array. Group names contain no dot. In a loaded checkpoint, missing groups are empty."""
     values: dict[str, Any]
     """Plain JSON values."""
 
@@ -47,19 +46,19 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path | None, key: str, what: str) -> Checkpoint | None:
-        """The checkpoint of `what` (in words: `the fit`). None if there is none with this key, and a line that says why."""
+        """The checkpoint of `what` (in words: `the fit`); None if no checkpoint has this key. Prints why one is not used."""
         if path is None or not path.is_file():
             return None
         try:
             stored, meta = read_npz(path)
         except DamagedFile as error:
-            print(f"{path}: unreadable ({error}); {what} starts afresh")
+            print(f"{path}: unreadable ({error}); {what} starts over")
             return None
         if (version := meta.get("format")) != CHECKPOINT_FORMAT:
-            print(f"{path}: a checkpoint of format {version}, this version reads {CHECKPOINT_FORMAT}; {what} starts afresh")
+            print(f"{path}: format {version}, but this version reads format {CHECKPOINT_FORMAT}; {what} starts over")
             return None
         if meta.get("key") != key:
-            print(f"{path}: made with other inputs or settings; {what} starts afresh")
+            print(f"{path}: made with other inputs or settings; {what} starts over")
             return None
         arrays: dict[str, dict[str, np.ndarray]] = defaultdict(dict)
         for label, array in stored.items():
@@ -69,55 +68,57 @@ class Checkpoint:
 
 
 def checkpoint_key(inputs: Mapping[str, str], settings: Mapping[str, Any], device: str, module: str) -> str:
-    """SHA-256 of inputs, settings, kind of device and the code of a module: a checkpoint with another key is not continued from."""
+    """SHA-256 of inputs, settings, kind of device and the code of a module. Only a checkpoint with the same key is resumed."""
     values = [dict(inputs), dict(settings), device.partition(":")[0], provenance.code_digest(module)]
     return hashlib.sha256(canonical(values).encode()).hexdigest()
 
 
 CHECKPOINT_EVERY = 5
-"""Epochs between checkpoints from which a killed training continues."""
+"""Epochs between two checkpoints of a training."""
 
 
 class TrainingLoop:
-    """The epochs that are left of a training which may have been killed before.
+    """The remaining epochs of a training, which resumes from its checkpoint.
 
-    The user restores `restored`, iterates over the loop, and calls `record` and then `save` in each epoch. A continued training
-    equals an uninterrupted one if its checkpoints hold all that an epoch depends on.
+    The caller restores `restored`, iterates over the loop, and calls `record` and then `save` in each epoch. A resumed training
+    equals an uninterrupted one if its checkpoints contain everything that an epoch depends on.
     """
 
     def __init__(self, what: str, label: str, epochs: int, partial: Path | None, key: str, *, share: float = 1.0) -> None:
-        """`what` is the training in messages, `label` in the progress line. A checkpoint is written to `partial` after each
-        CHECKPOINT_EVERY epochs and after the last; one that lies there is continued from if it has the same `key`. `share` is the
-        part of the time that counts for this training, where several run together."""
+        """Load the checkpoint at `partial` if it has this `key`; `save` writes it every CHECKPOINT_EVERY epochs and at the end.
+
+        `what` names the training in messages, `label` in the progress line. `share` is the fraction of the wall time that counts
+        for this training if several run together.
+        """
         self._share, self._begun = share, time.monotonic()
         self._epochs, self._partial, self._key = epochs, partial, key
         self._progress = Progress(label, epochs)
         self.history: list[dict[str, Any]] = []
-        """A row per epoch."""
+        """One row per epoch."""
         self.attempts = 1
-        """1, plus one for every time that the training continued from a checkpoint of a killed one."""
+        """1, plus the number of times that the training resumed from a checkpoint."""
         self.earlier_seconds = 0.0
-        """Wall time of earlier attempts, up to their last checkpoint; this training's share of what it had together with others."""
+        """Wall time of earlier attempts up to their last checkpoint, s, scaled by `share`."""
         self.restored = Checkpoint.load(partial, key, what)
-        """The checkpoint to continue from."""
+        """The checkpoint to resume from."""
         if self.restored:
             run = self.restored.values.pop("run")
             self.history, self.earlier_seconds = run["history"], run["seconds"]
             self.attempts = run["attempts"] + 1
-            print(f"continuing {what} after epoch {len(self.history) - 1}")
+            print(f"resuming {what} after epoch {len(self.history) - 1}")
 
     def __iter__(self) -> Iterator[int]:
-        """Numbers of the epochs that are left."""
+        """Yield the numbers of the remaining epochs."""
         while len(self.history) < self._epochs:
             yield len(self.history)
 
     def record(self, row: dict[str, Any], note: str) -> None:
-        """Add the row of a finished epoch to the history, and show progress."""
+        """Append the row of a finished epoch to the history and show progress."""
         self.history.append(row)
         self._progress.update(len(self.history), note)
 
     def save(self, checkpoint: Callable[[], Checkpoint]) -> None:
-        """Save the training's own state, with the history, if a checkpoint is due."""
+        """Save the training's state and history if a checkpoint is due."""
         done = len(self.history)
         if self._partial is None or (done % CHECKPOINT_EVERY and done < self._epochs):
             return
@@ -128,13 +129,13 @@ class TrainingLoop:
 
 
 def adam_arrays(optimizer: torch.optim.Optimizer) -> dict[str, np.ndarray]:
-    """Adam's state as copied arrays named `<index of the parameter>.<moment>`; none before the first step."""
+    """Adam's state as copied arrays named `<parameter index>.<moment>`; empty before the first step."""
     state = optimizer.state_dict()["state"]
     return {f"{index}.{moment}": value.cpu().numpy().copy() for index, slots in state.items() for moment, value in slots.items()}
 
 
 def restore_adam(optimizer: torch.optim.Optimizer, arrays: Mapping[str, np.ndarray]) -> None:
-    """Set Adam's state to that of `adam_arrays`; learning rates and other options stay."""
+    """Restore the state that `adam_arrays` returned; learning rates and other options do not change."""
     import torch
 
     state: dict[int, dict[str, torch.Tensor]] = {}

@@ -1,7 +1,7 @@
-"""A check as data: what is measured of a subject, the range that is fine, what a departure does to results, and the next step.
+"""Checks as data: a measurement, its accepted range, the effect on results outside of it, and the next step.
 
-A subject has a kind, a word, and is what `examine` is given of it: the masks of a camera, points in space, the content of a file. A
-measurement is a function of that.
+A measurement is a function of a subject, for example the masks of a camera, 3D points, or the content of a file. Each kind of
+subject has a name.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ class Check:
     """One check of one kind of subject."""
 
     name: str
-    """The finding's; the same for every occurrence."""
+    """Name of the finding; the same for every occurrence."""
     of: str
     """The kind of subject."""
     measure: Callable[..., float | Words | Iterable[Words] | None]
-    """Subject -> the value, or words with the value under `value`, or several of these; None: nothing to report.
+    """Subject -> the value, or a mapping of words with the value under `value`, or several of these; None: no finding.
 
-    Under `level`, `where` and `frames` a measurement may bring those of the finding, and under `detail` what follows the value."""
+    The words `level`, `where` and `frames` override those of the finding; `detail` is printed after the value."""
     limit: tuple[float, float] | None
-    """Lowest and highest value that is fine; None: whatever is measured is reported."""
+    """Lowest and highest accepted value; None: every measurement is reported."""
     level: Level
     sentence: str
     """What is measured: a format string over the words, `low` and `high` of the limit, and the subject as {0}, {1}, ..."""
     remedy: str = ""
-    """The next step, a format string too."""
+    """The next step; also a format string."""
     title: str | None = None
-    """Beginning of messages before the sentence, a format string: the key of a file; None: the name."""
+    """Start of the message before the sentence, a format string: the key of a file; None: the name."""
     unit: str = ""
     """Unit of the value; "%": the value is a fraction."""
     effect: str = ""
-    """What a departure does to results. With it, the message states value and range after the sentence."""
+    """Effect on results outside of the limit. If it is given, the message states value and limit after the sentence."""
     needs: tuple[str, ...] = ()
-    """Streams of a capture (color, depth, mask) without which the check is left out."""
+    """Streams of a capture (color, depth, mask) that the check requires; without them it is skipped."""
 
     def findings(self, where: object, *subject: Any) -> Iterator[Finding]:
-        """Every finding about a subject, at the file, camera or other place `where`."""
+        """Yield the findings about a subject; `where` is its file or camera."""
         low, high = self.limit or (-inf, inf)
         for measured in _several(self.measure(*subject)):
             value: Any = measured.get("value")
@@ -65,13 +65,13 @@ class Check:
                 text=f"{text} {remedy}".rstrip(),
                 remedy=remedy,
                 title=None if self.title is None else self.title.format(*subject, **words),
-                value=value.item() if hasattr(value, "item") else value,  # JSON has no numbers of NumPy
+                value=value.item() if hasattr(value, "item") else value,  # json cannot write NumPy scalars
                 limit=None if self.limit is None else (_bound(low), _bound(high)),
                 frames=tuple(int(frame) for frame in measured.get("frames", ())),
             )
 
     def shown(self, value: Any) -> str:
-        """A value with its unit."""
+        """The value with its unit, as text."""
         if isinstance(value, str):
             return value
         return f"{self._number(value)} {self.unit}".rstrip()
@@ -80,7 +80,7 @@ class Check:
         return f"{100 * value if self.unit == '%' else value:.4g}"
 
     def expected(self) -> str:
-        """The range that is fine, in words; empty without one."""
+        """The accepted range, in words; empty without a limit."""
         if self.limit is None:
             return ""
         low, high = self.limit

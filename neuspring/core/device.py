@@ -1,6 +1,6 @@
-"""Devices: Warp's start, the device that a setting means, kernels compiled once however many processes start.
+"""Devices: start Warp, resolve the device setting, compile each kernel once for all processes.
 
-The only module of this package that imports torch and Warp.
+This is the only module of the package that imports torch and Warp on import.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from neuspring.core.errors import InputError
 
 DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
 _loaded: set[tuple[int, str]] = set()
-# Warp makes the code of one module at a time in a process; fits that share launches are threads.
+# Warp generates code for one module at a time per process, and fits that share launches run in threads.
 _loading = threading.Lock()
 
 
 @functools.cache
 def start_warp() -> None:
-    """Initialize Warp once, quietly: kernels here carry their own adjoints."""
+    """Initialize Warp once, without its log and without automatic adjoints: the kernels of this package define their own."""
     wp.config.enable_backward = False
-    # Nothing of modules that it loads, only of errors.
+    # Warp logs every module that it loads.
     wp.config.log_level = logging.ERROR
     with _without_driver_warning():
         wp.init()
@@ -42,7 +42,7 @@ def start_warp() -> None:
 
 @contextlib.contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Drop Warp's native line about a missing CUDA driver where torch finds no GPU either; pass on everything else."""
+    """Drop Warp's native message about a missing CUDA driver if torch finds no GPU either; forward everything else."""
     if torch.cuda.is_available():
         yield
         return
@@ -62,20 +62,22 @@ def _without_driver_warning() -> Iterator[None]:
 
 
 def resolve_device(device: str) -> str:
-    """`auto` -> `cuda:0` where CUDA works, else `cpu`. Raises InputError for other words and for a device that is not there."""
+    """`auto` -> `cuda:0` if CUDA works, else `cpu`. Raises InputError for unknown words and missing devices."""
     if not DEVICES.fullmatch(device):
         raise InputError("device", "must be auto, cpu, cuda or cuda:N", repr(device))
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     held = os.environ.get("CUDA_VISIBLE_DEVICES", "").strip()
     holds = held not in ("", "-1")
-    # A job that holds a GPU which CUDA does not find has lost it; but a torch without CUDA never finds one.
+    # If CUDA does not find the GPU that this job holds, the GPU is lost. A torch without CUDA never finds one.
     lost = holds and bool(torch.version.cuda)
     if device == "cpu" or (device == "auto" and count == 0 and not lost):
         if device == "auto" and holds:
             _warn_of_idle_gpu(held)
         return "cpu"
     if not torch.version.cuda:
-        raise InputError("device", "this torch is a build for the CPU alone", device, "Install its CUDA build, or use device: cpu.")
+        raise InputError(
+            "device", "the installed torch supports only the CPU", device, "Install its CUDA build, or use device: cpu."
+        )
     index = int(device.partition(":")[2] or 0)
     if index >= count:
         raise InputError("device", f"this machine has {count} CUDA devices", device, "Use device: cpu or auto.")
@@ -84,17 +86,17 @@ def resolve_device(device: str) -> str:
 
 @functools.cache
 def _warn_of_idle_gpu(held: str) -> None:
-    """Once a process: a job of hours on the CPU, and a GPU that nobody else may use, must not go unseen."""
+    """Warn once per process: the job may run for hours on the CPU and blocks a GPU."""
     print(
-        f"warning: this job holds GPU {held}, but this torch is a build for the CPU alone, where it computes. "
-        "With device: cuda this is an error.",
+        f"warning: this job holds GPU {held} but runs on the CPU, because the installed torch supports only the CPU. "
+        "Install the CUDA build of torch; with device: cuda this is an error.",
         file=sys.stderr,
         flush=True,
     )
 
 
 def load(kernel: Any, device: Any) -> Any:
-    """Compile and load a kernel on a device before it is launched; returns the kernel."""
+    """Compile and load a kernel on a device before its first launch; returns the kernel."""
     key = (id(kernel), str(device))
     if key not in _loaded:
         wp.init()
@@ -104,6 +106,6 @@ def load(kernel: Any, device: Any) -> Any:
         name = hashlib.sha256(f"{kernel.module.name} {kernel.key}".encode()).hexdigest()[:16]
         with _loading, FileLock(folder / f"{name}.lock"):
             wp.load_module(kernel.module, device=device)
-        # Kernels live as long as the process: each module caches its own.
+        # Kernels live as long as the process: every module caches its kernels.
         _loaded.add(key)
     return kernel

@@ -1,4 +1,4 @@
-"""The errors a caller can cause. Each message names the file or field, the rule, the value received and the next move."""
+"""Errors that a caller can cause. Each message names the file or field, the rule, the received value and the next move."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Bad input: `where` broke `rule`; we received `value`; do `remedy` next.
+    """Invalid input: `where` violates `rule`; `value` was received; `remedy` is the next move.
 
-    Exit status 2 on the command line: only another input can help.
+    The command line exits with status 2: the same input fails again.
     """
 
     def __init__(self, where: object, rule: str, value: object = None, remedy: str = "") -> None:
@@ -21,15 +21,15 @@ class InputError(ValueError):
 
 
 class NumericalFailure(RuntimeError):
-    """A computation that ended outside its physical range (for example: every candidate of a search diverged).
+    """A computation that left its physical range (for example: every candidate of a search diverged).
 
-    This is a result, not a crash: stages record it as `status: failed` with this reason, and tables show it.
+    Stages record it as `status: failed` with this reason, and tables show it.
     """
 
 
 def full_disk(path: Path) -> InputError:
-    """The error of a file that does not fit on its disk."""
+    """The error for a file that does not fit on its disk."""
     disk = next(folder for folder in [path.absolute(), *path.absolute().parents] if folder.is_mount())
-    free, whole = (size / 1e9 for size in (shutil.disk_usage(disk).free, shutil.disk_usage(disk).total))
-    rule = f"no space left on device: the disk at {disk} has {free:.1f} of {whole:.1f} GB free"
-    return InputError(path, rule, None, "Free some space there; the same command continues, and what is finished is kept.")
+    free, total = (size / 1e9 for size in (shutil.disk_usage(disk).free, shutil.disk_usage(disk).total))
+    rule = f"no space left on device: the disk at {disk} has {free:.1f} of {total:.1f} GB free"
+    return InputError(path, rule, None, "Free some space there, then rerun the same command to resume.")

@@ -1,4 +1,4 @@
-"""Packages that serve one corner of the platform, and the extra of the installation that brings each."""
+"""Optional packages, and the extra of the installation that contains each."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ EXTRAS = {
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra in the pinned versions."""
+    """The command that installs an extra with the pinned versions."""
     return f'.venv/bin/pip install -c workflow/envs/constraints.txt -e ".[{extra}]"'
 
 
 def needed(module: str) -> Any:
-    """A module of an extra, imported. Raises InputError that names the extra if the package is not installed."""
+    """Import and return a module of an extra. Raises InputError, which names the extra, if the package is not installed."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -40,4 +40,4 @@ def needed(module: str) -> Any:
         if error.name is None or error.name.partition(".")[0] != package:
             raise
         extra = EXTRAS[package]
-        raise InputError(f"package {package}", f"the extra [{extra}] is required here", "not installed", install(extra)) from error
+        raise InputError(f"package {package}", f"the extra [{extra}] is required", "not installed", install(extra)) from error

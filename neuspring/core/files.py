@@ -1,5 +1,6 @@
-"""Files that are whole or not there: each is written aside, flushed, and renamed when complete. Text, tables, JSON, and `.npz`
-files of named arrays and one JSON text, without pickle, read with every sort of damage named.
+"""Atomic file writes: a temporary file is written, flushed and renamed, so no partial file exists.
+
+Text, tables, JSON, and `.npz` files with named arrays and one JSON text, without pickle. Readers report how a file is damaged.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ if TYPE_CHECKING:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write(temporary path)` beside `path`, flush it to disk, then rename it over `path`.
+    """Call `write` with a temporary path in the same folder, flush the file to disk, then rename it to `path`.
 
-    Raises InputError if the folder cannot be written.
+    Raises InputError if the folder is not writable.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     except OSError as error:
         raise InputError(
-            path.parent, "this folder must be writable", error.strerror, "Choose another results folder or fix its permissions."
+            path.parent, "this folder must be writable", error.strerror, "Fix its permissions or choose another results folder."
         ) from error
     os.close(handle)
     temporary = Path(name)
@@ -43,7 +44,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.chmod(0o644)
         temporary.replace(path)
     except OSError as error:
-        # A write that fails does not name its file.
+        # The OSError of a failed write names no file.
         error.filename = error.filename or str(path)
         raise
     finally:
@@ -62,7 +63,7 @@ def write_table(table: pd.DataFrame, path: Path) -> Path:
 
 
 def write_history(steps: Any, columns: Mapping[str, pd.Series], path: Path) -> Path:
-    """Write metrics over steps as MLflow takes them, long: step, metric, value; missing values are left out."""
+    """Write metrics per step in MLflow's long format (step, metric, value), without missing values; returns the path."""
     import pandas as pd
 
     parts = [pd.DataFrame({"step": np.asarray(steps), "metric": name, "value": v.to_numpy(float)}) for name, v in columns.items()]
@@ -70,16 +71,15 @@ def write_history(steps: Any, columns: Mapping[str, pd.Series], path: Path) -> P
 
 
 META = "meta"
-"""Name of the array that holds the JSON text."""
+"""Name of the array with the JSON text."""
 
 
 NPZ_FAULTS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, TypeError, RuntimeError)
-"""Exceptions of reading a damaged .npz file: zipfile raises RuntimeError for damaged flags, and np.load returns a bare array
-(TypeError) for an .npy file."""
+"""Exceptions for damaged .npz files: zipfile raises RuntimeError for damaged flags, and an .npy file causes a TypeError."""
 
 
 class DamagedFile(ValueError):
-    """A file that is no whole `.npz` file with a JSON mapping; says what is wrong."""
+    """A file that is not a complete `.npz` file with a JSON mapping; the message states the fault."""
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray], meta: str, *, compress: bool) -> None:
@@ -94,13 +94,13 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray], meta: str, *, compre
 
 
 def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the JSON mapping of a file that exists. Raises DamagedFile."""
+    """The arrays and the JSON mapping of an existing file. Raises DamagedFile."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         meta = json.loads(arrays.pop(META).tobytes().decode())
         if not isinstance(meta, dict):
-            raise ValueError("`meta` holds no mapping")
+            raise ValueError("`meta` contains no mapping")
     except NPZ_FAULTS as error:
         raise DamagedFile(f"{type(error).__name__}: {error}") from error
     return arrays, meta
@@ -122,7 +122,7 @@ def read_head(path: Path) -> tuple[dict[str, tuple[int, ...]], dict[str, Any]]:
                         read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
                         shapes[name] = read(stream)[0]
         if not isinstance(mapping, dict):
-            raise ValueError(f"`{META}` holds no mapping")
+            raise ValueError(f"`{META}` contains no mapping")
     except FileNotFoundError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, TypeError, RuntimeError) as error:
@@ -134,27 +134,27 @@ FOREIGN = (
     (
         rb"\x76\x2f\x31\x01",
         "an OpenEXR image",
-        "OpenCV's wheels do not read it. Make .npy of it, in meters: pip install OpenEXR; python -c \"import OpenEXR, numpy, sys; "
+        "OpenCV's wheels do not read it. Convert it to .npy, in m: pip install OpenEXR; python -c \"import OpenEXR, numpy, sys; "
         "[numpy.save(f[:-4], numpy.atleast_3d(next(iter(OpenEXR.File(f).channels().values())).pixels)[..., 0]) "
         'for f in sys.argv[1:]]" *.exr',
     ),
     (
         rb"glTF",
         "a binary glTF model (GLB)",
-        "Make a PLY file of it: python -c \"import trimesh; trimesh.load('a.glb', force='mesh').export('nodes.ply')\"; y is up in "
-        "glTF, so turn the points into the world of the capture.",
+        "Convert it to PLY: python -c \"import trimesh; trimesh.load('a.glb', force='mesh').export('nodes.ply')\"; y is up in "
+        "glTF, so rotate the points into the world of the capture.",
     ),
     (
         rb"[\x01-\x7f]\x50",
         "a C3D file of a motion capture system",
-        "Read it by ezc3d (pip install ezc3d) and write the points in meters; a marker with a residual below 0 was not seen.",
+        "Read it with ezc3d (pip install ezc3d) and write the points in meters; a marker with a residual below 0 was not seen.",
     ),
 )
-"""First bytes of files of other programs that are given in place of ours, what they are, and how they are converted."""
+"""First bytes, name and conversion of other programs' files that users pass by mistake."""
 
 
 def foreign(path: Path) -> tuple[str, str]:
-    """The name of a file of `FOREIGN`, and its conversion; "" of any other."""
+    """The name and the conversion of a file in a format of `FOREIGN`; empty texts for any other file."""
     try:
         with path.open("rb") as stream:
             first = stream.read(16)
@@ -164,7 +164,7 @@ def foreign(path: Path) -> tuple[str, str]:
 
 
 def load_json(path: Path) -> Any:
-    """Parse a JSON file of the data set. Raises InputError."""
+    """Parse a JSON file of a data set. Raises InputError."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Choices among points, rigid motions, and how lines run."""
+"""Point selection and rigid motions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def farthest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most `count` points [n, 3], each the farthest from those before; the first is point 0."""
+    """Indices of at most `count` of the points [n, 3] by farthest-point sampling, starting with point 0."""
     if not len(points):
         return np.zeros(0, dtype=int)
     chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
@@ -17,20 +17,20 @@ def farthest(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def on_table(points: np.ndarray, up: float) -> np.ndarray:
-    """Points [..., 3] with those below the table z = 0 moved up to it; `up` is +1 or -1."""
+    """Points [..., 3] in which points below the table z = 0 are moved up to it; `up` is +1 or -1."""
     lifted = np.array(points, dtype=float)
     lifted[..., 2] = up * np.maximum(up * lifted[..., 2], 0.0)
     return lifted
 
 
 SPREAD = 0.05
-"""m between hands from which what hangs from them turns about the line through them alone."""
+"""Distance between hands, m, above which a hanging object rotates only about the line through them."""
 
 
 def lean(points: np.ndarray, hands: np.ndarray, up: float) -> np.ndarray:
-    """Rotation vector [3], rad, after which the center of points [n, 3] is below the hands [C, 3] that it hangs from.
+    """Rotation vector [3], rad, that moves the center of points [n, 3] below the controllers [C, 3] from which they hang.
 
-    It is horizontal, and along the hands where they are SPREAD apart.
+    The axis is horizontal; if the controllers extend over more than SPREAD, it is parallel to their main direction.
     """
     below = points.mean(axis=0) - hands.mean(axis=0)
     sideways = hands[:, :2] - hands[:, :2].mean(axis=0)

@@ -1,7 +1,7 @@
-"""Records of the workflow's jobs: results/jobs/<rule>/<name>/<digest>.json of a finished job, failed.json of one that failed.
+"""Records of the workflow's jobs: results/jobs/<rule>/<name>/<digest>.json for a finished job, failed.json for a failed one.
 
-The digest is that of everything the result follows from, so the name of the file tells Snakemake whether a job is finished. A
-job's log and Snakemake's benchmark lie beside it.
+The digest covers everything that the result depends on, so Snakemake recognizes finished jobs by file name. The job's log and
+Snakemake's benchmark are in the same folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FAILED = "failed.json"
 
 @dataclass(frozen=True, kw_only=True)
 class JobRecord:
-    """The end of a job, or of one member of a batch."""
+    """The outcome of a job, or of one member of a batch."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
     rule: str
@@ -34,30 +34,30 @@ class JobRecord:
     """<rule>/<wildcards joined by />."""
     outcome: Literal["ok", "failed"] = "ok"
     message: str = ""
-    """The error, in a line; empty for a job that succeeded."""
+    """The error in one line; empty for a successful job."""
     log: str = ""
-    """Relative to the results folder."""
+    """Path relative to the results folder."""
     started: str = ""
     """UTC, ISO 8601."""
     seconds: float = 0.0
     host: str = ""
     devices: list[str] = field(default_factory=list)
-    """GPUs, as in CUDA_VISIBLE_DEVICES; empty on the CPU."""
+    """GPUs, as in CUDA_VISIBLE_DEVICES; empty for a CPU job."""
     device_names: list[str] = field(default_factory=list)
     peak_memory_mb: float = 0.0
     files: list[str] = field(default_factory=list)
-    """Results, relative to the results folder. The record is void without them."""
+    """Paths of results relative to the results folder. Without these files the job counts as unfinished."""
     made_of: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Step -> settings, options, code and inputs that the digest is of."""
+    """Step -> settings, options, code and inputs, from which the digest is computed."""
 
     @property
     def scenario(self) -> str:
-        """The first wildcard."""
+        """The scenario: the first wildcard of the name."""
         return self.name.split("/")[1]
 
     @property
     def failed(self) -> bool:
-        """True where it ended without success."""
+        """True if the job did not succeed."""
         return self.outcome == "failed"
 
     def save(self, path: Path) -> None:
@@ -79,9 +79,9 @@ def _adapter() -> TypeAdapter[JobRecord]:
 
 
 def read_jobs(results: Path, damaged: list[str] | None = None) -> list[JobRecord]:
-    """The records of all jobs of a results folder, by name.
+    """The records of all jobs of a results folder, sorted by path.
 
-    Errors of damaged records are added to `damaged`. Without that list, a damaged record raises InputError.
+    Errors of damaged records are appended to `damaged`. Without that list, a damaged record raises InputError.
     """
     records = []
     for path in sorted((Path(results) / FOLDER).glob("*/**/*.json")):
@@ -95,12 +95,12 @@ def read_jobs(results: Path, damaged: list[str] | None = None) -> list[JobRecord
 
 
 def keep_asked(results: Path, about: Mapping[str, Any]) -> None:
-    """Keep what a run of the workflow is about."""
+    """Write what the current run of the workflow was asked to do (`asked`)."""
     write_text(Path(results) / FOLDER / ASKED, json.dumps(dict(about)) + "\n")
 
 
 def asked(results: Path) -> dict[str, Any]:
-    """The last run of the workflow: `command` (words), `only`, `scenarios`, `methods`, `seeds`; empty if unknown."""
+    """The last run of the workflow: `command` (words), `only`, `jobs`, `scenarios`, `methods`, `seeds`; empty if unknown."""
     try:
         values = json.loads((Path(results) / FOLDER / ASKED).read_text())
     except (OSError, ValueError):

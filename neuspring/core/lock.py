@@ -1,8 +1,8 @@
-"""Locks that a command can inherit.
+"""File locks that a command can inherit.
 
-`filelock.FileLock` is the lock of this package wherever a lock ends with a `with` block. It does not fit a job, whose lock must
-last as long as its command even if the wrapper dies: `FileLock` unlocks the file for all holders on release, and drops it in
-forked processes. Here the same kernel lock belongs to an open file.
+A job's lock must last as long as its command, even if the wrapper dies. `filelock.FileLock` cannot do this: on release it unlocks
+the file for all holders, and forked processes drop the lock. Here the same kernel lock belongs to an open file. Locks that end
+with a `with` block use `FileLock`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import IO
 from filelock import lock_descriptor
 
 LOCK_POLL = 0.01
-"""s between two attempts to lock."""
+"""Time between two attempts to lock, s."""
 
 
 def try_lock(path: Path) -> IO[str] | None:
-    """Lock the file at `path`, which is made if it is missing; None if it is locked. Raises OSError.
+    """Lock the file at `path` and return it; None if it is locked already. Creates a missing file. Raises OSError.
 
-    The lock is free when the returned file is closed here and in every process that inherited its descriptor.
+    The lock is released when this process and all processes that inherited the descriptor have closed the file.
     """
     while True:
         file = _open(path)
@@ -38,7 +38,7 @@ def try_lock(path: Path) -> IO[str] | None:
 
 
 def wait_for_lock(path: Path) -> IO[str]:
-    """The file of `try_lock`, after waiting until the lock is free."""
+    """Wait until the lock is free, and return the file of `try_lock`."""
     while (file := try_lock(path)) is None:
         time.sleep(LOCK_POLL)
     return file
@@ -48,12 +48,12 @@ def _open(path: Path) -> IO[str]:
     try:
         return path.open("a+", encoding="utf-8")
     except PermissionError:
-        # Another user's file in a shared folder. Reading is enough to lock it on a local disk.
+        # The file belongs to another user of a shared folder. On a local disk, read access suffices for a lock.
         return path.open(encoding="utf-8")
 
 
 def _is_at(file: IO[str], path: Path) -> bool:
-    """True where the file is still the one at `path`: its last holder may have removed it before we locked it."""
+    """True if the file is still the one at `path`: its last holder may have removed it before it was locked here."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:

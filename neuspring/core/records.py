@@ -1,7 +1,7 @@
-"""Stage and run records: small JSON files that say what a step did, beside the artifacts they name.
+"""Stage records: small JSON files that describe what a step did, in the same folder as the artifacts that they name.
 
-A stage record is the declared output of a workflow rule. It is written last, so its presence means that the files it names
-are complete. A numerical failure is a record too (`status: failed` with its reason); later stages pass it on.
+A stage writes its record last, so an existing record means that its files are complete. A numerical failure is also a record
+(`status: failed` with a reason), and later stages pass it on.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from neuspring.core.errors import InputError
 from neuspring.core.files import write_text
 
 RECORD_FORMAT = 2
-OTHER_FORMAT_REMEDY = "The commit that made older results reads them. Delete this folder, or use another: --config results=..."
+OTHER_FORMAT_REMEDY = "Read it with the commit that wrote it. Delete this folder or use another: --config results=..."
 MOST_RECORD_BYTES = 50_000_000
-"""Bytes of a record, at most: it is read whole."""
+"""Maximum size of a record, bytes: it is read into memory."""
 COMPUTING = ("numpy", "scipy", "torch", "warp-lang")
 """Packages on whose versions results depend."""
 CAPTURE_FOLDER = "capture_folder"
-"""The fact of a scenario's observations.json that says where its capture lies."""
+"""The fact of a scenario's observations.json with the folder of its capture."""
 Status = Literal["ok", "failed"]
 
 
@@ -40,7 +40,7 @@ def digest_file(path: Path) -> str:
 
 
 def canonical(values: Any) -> str:
-    """JSON text that is equal for equal values: sorted keys, no spaces, no NaN."""
+    """Canonical JSON text, which is equal for equal values: sorted keys, no spaces, no NaN."""
     return json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
@@ -51,29 +51,29 @@ def now() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageRecord:
-    """Record of one run of a stage. `files` maps a role (for example "twin") to [file name beside the record, SHA-256]."""
+    """Record of one execution of a stage. `files`: role (for example "twin") -> [name of a file in the same folder, SHA-256]."""
 
     stage: str
     status: Status
     reason: str = ""
     files: dict[str, list[str]] = field(default_factory=dict)
     inputs: dict[str, str] = field(default_factory=dict)
-    """Role -> SHA-256 of what was read."""
+    """Role -> SHA-256 of the input file."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """Numbers and text worth keeping: parameters found, counts, versions."""
+    """Results as numbers and text: found parameters, counts."""
     settings: dict[str, Any] = field(default_factory=dict)
     started: str = ""
     seconds: float = 0.0
-    """Wall time, with the attempts that it continued."""
+    """Wall time, including attempts from whose checkpoints the stage resumed."""
     peak_memory_mb: float = 0.0
     attempts: int = 1
-    """1, plus one for every time the stage continued from a checkpoint."""
+    """1, plus the number of times that the stage resumed from a checkpoint."""
     device: str = "cpu"
     machine: str = ""
     versions: dict[str, str] = field(default_factory=dict)
-    """Versions of the packages that compute."""
+    """Versions of the packages in `COMPUTING`."""
     code: str = ""
-    """Digest of the code that made it (`neuspring.core.provenance`); empty in records of older versions."""
+    """Digest of the stage's code (`neuspring.core.provenance`); empty in records of older versions."""
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -87,43 +87,45 @@ class StageRecord:
         try:
             return cls(**values)
         except TypeError as error:
-            raise InputError(path, "must be a stage record", str(error), "Delete it and run again.") from error
+            raise InputError(path, "must be a stage record", str(error), "Delete it and rerun the command.") from error
 
     def file(self, role: str, record_path: Path) -> Path:
-        """The file of a role, checked against its digest. Raises InputError if it is missing or has changed."""
+        """The file of a role, verified by its digest. Raises InputError if it is missing or has changed."""
         if role not in self.files:
             raise InputError(record_path, f"this record must name a {role}", sorted(self.files))
         name, digest = self.files[role]
         if Path(name).name != name:
-            raise InputError(record_path, "files must lie beside their record", name, "Do not use this folder.")
+            raise InputError(record_path, "files must be in the folder of their record", name, "Do not use this folder.")
         path = Path(record_path).parent / name
         if not path.is_file():
-            raise InputError(path, f"named by {record_path}", "no such file", f"Delete {record_path} and run again.")
+            raise InputError(
+                path, f"this file of {record_path} must exist", "no such file", f"Delete {record_path} and rerun the command."
+            )
         if digest_file(path) != digest:
             raise InputError(
-                path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and run again."
+                path, f"must be the file that {record_path} names", "other content", f"Delete {record_path} and rerun the command."
             )
         return path
 
 
 @dataclass(frozen=True)
 class Before:
-    """An earlier stage, by its record."""
+    """An earlier stage: its record and where it is."""
 
     path: Path
     record: StageRecord
 
     @classmethod
     def load(cls, path: Path) -> Before:
-        """Raises InputError for a record that is missing or damaged."""
+        """Read a record. Raises InputError if it is missing or damaged."""
         return cls(Path(path), StageRecord.load(path))
 
     def has(self, role: str) -> bool:
-        """True where the stage wrote a file of this role."""
+        """True if the stage wrote a file of this role."""
         return role in self.record.files
 
     def file(self, role: str) -> Path:
-        """The file of a role. Raises InputError if it is missing or has changed since."""
+        """The file of a role, verified by its digest. Raises InputError if it is missing or has changed."""
         return self.record.file(role, self.path)
 
 
@@ -131,12 +133,12 @@ def read_json(path: Path, version: int) -> dict[str, Any]:
     """A JSON record of the given format version, without its `format` key. Raises InputError."""
     try:
         if (size := Path(path).stat().st_size) > MOST_RECORD_BYTES:
-            raise InputError(path, f"a record has at most {MOST_RECORD_BYTES} bytes", size, "Delete it and run again.")
+            raise InputError(path, f"must have at most {MOST_RECORD_BYTES} bytes", size, "Delete it and rerun the command.")
         values = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(path, "this record must be readable", error.strerror, "Run the step that makes it first.") from error
+        raise InputError(path, "this record must be readable", error.strerror, "Run the step that writes it first.") from error
     except ValueError as error:
-        raise InputError(path, "this record must be JSON", str(error), "Delete it and run again.") from error
+        raise InputError(path, "this record must be JSON", str(error), "Delete it and rerun the command.") from error
     if not isinstance(values, dict) or values.pop("format", None) != version:
         raise InputError(path, f"this version reads records of format {version}", "another format", OTHER_FORMAT_REMEDY)
     return values
@@ -145,8 +147,8 @@ def read_json(path: Path, version: int) -> dict[str, Any]:
 class Recorder:
     """Measures a stage and writes its record.
 
-    Make it when the stage begins; `inputs` are digested at once, so that the record names what was read. Raises InputError for an
-    input that cannot be read.
+    Create it when the stage starts: it digests `inputs` at once, so the record names the content that was read. Raises InputError
+    for unreadable inputs.
     """
 
     def __init__(
@@ -166,33 +168,33 @@ class Recorder:
             try:
                 self.inputs[role] = digest_file(path)
             except OSError as error:
-                rule, remedy = "this file must be readable", "Run the step that makes it first."
+                rule, remedy = "this file must be readable", "Run the step that writes it first."
                 raise InputError(path, rule, error.strerror, remedy) from error
         self.settings: dict[str, Any] = dict(settings or {})
         self.device = device
         self.sharers = 1
-        """Stages that run in one batch; each is charged an equal part of the time."""
+        """Number of stages in the same batch; the wall time is divided by it."""
         self._started, self._start = now(), time.perf_counter()
 
     @property
     def seconds(self) -> float:
-        """Seconds so far."""
+        """Elapsed time, s."""
         return time.perf_counter() - self._start
 
     def agrees(self) -> bool:
-        """True where the record and its files are there already, made of the same inputs, settings and code."""
+        """True if the record and its files exist and were made from the same inputs, settings and code."""
         try:
-            there = StageRecord.load(self.output)
+            existing = StageRecord.load(self.output)
         except InputError:
             return False
         settings = json.loads(json.dumps(self.settings))
-        # A stage may add what it found, such as `oracle`.
-        same = all(name in there.settings and there.settings[name] == value for name, value in settings.items())
-        made = (there.stage, there.inputs, there.code) == (self.stage, self.inputs, self.code)
-        return same and made and all(self.output.with_name(name).is_file() for name, _ in there.files.values())
+        # A stage may add settings while it runs, such as `oracle`.
+        same = all(name in existing.settings and existing.settings[name] == value for name, value in settings.items())
+        made = (existing.stage, existing.inputs, existing.code) == (self.stage, self.inputs, self.code)
+        return same and made and all(self.output.with_name(name).is_file() for name, _ in existing.files.values())
 
     def beside(self, **names: str) -> dict[str, Path]:
-        """Role -> path of a file beside the record."""
+        """Role -> path of a file in the record's folder."""
         return {role: self.output.with_name(name) for role, name in names.items()}
 
     def save(
@@ -204,8 +206,8 @@ class Recorder:
         attempts: int = 1,
         earlier_seconds: float = 0.0,
     ) -> None:
-        """Write the record, with time, peak memory, machine and the digests of `files`; `failure` says why the stage failed."""
-        # Linux counts in KiB, macOS in bytes.
+        """Write the record with time, peak memory, machine and digests of `files`; `failure` is the reason of a failed stage."""
+        # ru_maxrss is in KiB on Linux and in bytes on macOS.
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
         StageRecord(
             stage=self.stage,

@@ -1,7 +1,7 @@
-"""The folder of a run, results/{scenario}/{method}/{seed}: which stages made it, and the files that their records name.
+"""The folder of a run, results/{scenario}/{method}/{seed}: its stages, and the files that their records name.
 
-The one reader for scores, report, play, export and pictures. A run's stages may lie elsewhere in the scenario's folder, where
-methods share them: a record names its inputs by digest, and `RunFolder.of` follows these.
+Scores, report, play, exports and figures read runs only through this module. Methods share stages, so a stage's record may be in
+another folder of the scenario: records name their inputs by digest, and `RunFolder.of` follows these digests.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEARNING_STAGES = ("search", "fit", "train")
-"""Stages that produce a model, in order. A run's model is from the last of these that it has."""
+"""Stages that produce a model, in order. A run's model comes from the last of them that the run has."""
 RESULTS = ("twin", "model", "trajectory", "centers")
-"""Roles of a stage's files that are results; its other files say how it got there."""
+"""Roles of files that are results; other files describe how a stage obtained them."""
 OBSERVATIONS_FILE = "observations.npz"
 
 
@@ -36,26 +36,26 @@ class RunFolder:
 
     @classmethod
     def of(cls, folder: Path, damaged: list[str] | None = None) -> RunFolder:
-        """The run in a folder: its own records, and those that they were made from.
+        """Read the run in a folder: its own records, and the records of their inputs.
 
-        What cannot be read raises InputError; with a list `damaged` the message goes there, and the rest is read.
+        Raises InputError for unreadable records; with a list `damaged`, the messages are appended there instead.
         """
-        folder, found = Path(folder).resolve(), dict[str, Before]()
+        folder, stages = Path(folder).resolve(), dict[str, Before]()
 
         def add(find: Callable[[], Mapping[str, Before]]) -> None:
             try:
-                found.update(find())
+                stages.update(find())
             except InputError as error:
                 if damaged is None:
                     raise
                 damaged.append(str(error))
 
         add(lambda: _own(folder, "rollout"))
-        add(lambda: _behind(folder, found["rollout"].record) if "rollout" in found else _own(folder, *LEARNING_STAGES))
-        add(lambda: _behind(folder, found["fit"].record) if "fit" in found else {})
+        add(lambda: _learned(folder, stages["rollout"].record) if "rollout" in stages else _own(folder, *LEARNING_STAGES))
+        add(lambda: _learned(folder, stages["fit"].record) if "fit" in stages else {})
         add(lambda: _own(folder, "render"))
-        add(lambda: _splats(folder, found.get("render")))
-        return cls(folder, {name: found[name] for name in (*LEARNING_STAGES, "rollout", "appearance", "render") if name in found})
+        add(lambda: _splats(folder, stages.get("render")))
+        return cls(folder, {name: stages[name] for name in (*LEARNING_STAGES, "rollout", "appearance", "render") if name in stages})
 
     @property
     def scenario_folder(self) -> Path:
@@ -68,18 +68,18 @@ class RunFolder:
         return {name: before.record for name, before in self.stages.items()}
 
     def file(self, stage: str, role: str) -> Path | None:
-        """The file that a stage names; None if the run has no such stage or the stage no such file."""
+        """The file of a stage and role; None if the run has no such stage or the stage has no such file."""
         before = self.stages.get(stage)
         return before.file(role) if before and before.has(role) else None
 
     @property
     def learning(self) -> list[str]:
-        """The stages that learned the run's model, in order."""
+        """Names of the stages that learned the run's model, in order."""
         return [name for name in LEARNING_STAGES if name in self.stages]
 
     @property
     def maker(self) -> StageRecord:
-        """The stage that made the run's model; of what learns nothing, the rollout."""
+        """The record of the stage that made the run's model; for methods that learn nothing, of the rollout."""
         return self.stages[self.learning[-1] if self.learning else "rollout"].record
 
     @property
@@ -89,32 +89,32 @@ class RunFolder:
 
     @property
     def twin_file(self) -> Path | None:
-        """The run's twin; None if it has none."""
+        """The file of the run's twin; None if it has none."""
         return self.file("fit" if "fit" in self.stages else "search", "twin")
 
     @cached_property
     def twin(self) -> Twin | None:
-        """The twin, where the method has one."""
+        """The twin; None if the method has none."""
         return Twin.load(self.twin_file) if self.twin_file else None
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
-        """The prediction, where there is one."""
+        """The prediction; None if there is none."""
         path = self.file("rollout", "trajectory")
         return Trajectory.load(path) if path else None
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """Errors per task and metric, in the unit that each row names. Raises InputError if there are none."""
+        """Errors per task and metric, in the unit of each row. Raises InputError if the file is missing."""
         import pandas as pd
 
         path = self.folder / "scores.parquet"
         if not path.is_file():
-            raise InputError(path, "the scores of the run must be there", "no such file", "Run the workflow again.")
+            raise InputError(path, "the scores of the run must exist", "no such file", "Rerun the workflow.")
         return pd.read_parquet(path)
 
     def summary(self) -> pd.DataFrame:
-        """Errors for reading: a row per metric and unit, a column per task; lengths in mm, with four significant digits.
+        """Errors for display: one row per metric and unit, one column per task; lengths in mm, four significant digits.
 
         Raises InputError if there are no scores.
         """
@@ -127,39 +127,37 @@ class RunFolder:
 
     @cached_property
     def observations(self) -> Observations:
-        """Observations of the scenario. Raises InputError where they are missing, or others than the run was made from."""
+        """Observations of the scenario. Raises InputError if they are missing or differ from the run's inputs."""
         path = self.scenario_folder / OBSERVATIONS_FILE
         if not path.is_file():
-            raise InputError(
-                path, "the observations of the run must be there", "no such file", "Use the results folder it was made in."
-            )
+            raise InputError(path, "the observations of the run must exist", "no such file", "Use the run's own results folder.")
         made_from = {before.record.inputs.get("observations") for before in self.stages.values()} - {None}
         if made_from and digest_file(path) not in made_from:
-            raise InputError(path, f"must be what {self.folder} was made from", "other content", "Run the workflow again.")
+            raise InputError(path, f"must be the observations of {self.folder}", "other content", "Rerun the workflow.")
         return Observations.load(path)
 
 
 def _own(folder: Path, *names: str) -> dict[str, Before]:
-    """The stages of these names whose records lie in the run's own folder."""
+    """The stages of these names whose records are in the run's own folder."""
     return {name: Before.load(path) for name in names if (path := folder / f"{name}.json").is_file()}
 
 
-def _behind(folder: Path, record: StageRecord) -> dict[str, Before]:
-    """The learning stages that a record names as inputs, wherever in the scenario's folder they lie."""
-    wanted = {record.inputs[role] for role in ("learned", *LEARNING_STAGES) if role in record.inputs}
-    found: dict[str, Before] = {}
+def _learned(folder: Path, record: StageRecord) -> dict[str, Before]:
+    """The learning stages that a record has as inputs, from any folder of the scenario."""
+    digests = {record.inputs[role] for role in ("learned", *LEARNING_STAGES) if role in record.inputs}
+    stages: dict[str, Before] = {}
     for name in LEARNING_STAGES:
         for path in (folder / f"{name}.json", *sorted(folder.parents[1].glob(f"*/*/{name}.json"))):
-            if name not in found and path.is_file() and digest_file(path) in wanted:
-                found[name] = Before.load(path)
-    if wanted and not found:
-        rule = f"the record of its model must lie in {folder.parents[1]}, unchanged since {record.stage} was made"
-        raise InputError(folder, rule, "none", "Use the results folder in which the run was made.")
-    return found
+            if name not in stages and path.is_file() and digest_file(path) in digests:
+                stages[name] = Before.load(path)
+    if digests and not stages:
+        rule = f"the record of its model must be in {folder.parents[1]}, unchanged after {record.stage}"
+        raise InputError(folder, rule, "none", "Use the run's own results folder.")
+    return stages
 
 
 def _splats(folder: Path, render: Before | None) -> dict[str, Before]:
-    """The splats of the run's pictures, else those of its seed, if there are any."""
+    """The splats from which the run was rendered; without a rendering, the splats of its seed, if they exist."""
     records = sorted(folder.parents[1].glob("appearance*/*/appearance.json"))
     if render:
         records = [path for path in records if digest_file(path) == render.record.inputs.get("appearance")]

@@ -1,7 +1,6 @@
-"""The types of which settings are made: strict (no casts, no unknown keys) and bounded.
+"""Types of settings: strict (no casts, no unknown keys) and bounded.
 
-They stand below `neuspring.config`, because the settings of a baseline are declared where its code is, and the configuration takes
-them from there.
+They are not in `neuspring.config`, because that package imports the settings of baselines, which use these types.
 """
 
 from __future__ import annotations
@@ -23,24 +22,27 @@ Range = tuple[Finite, Finite]
 
 
 class SettingsSection:
-    """Base of the dataclasses of settings."""
+    """Base class of all sections of settings."""
 
     __pydantic_config__ = STRICT
     efforts: ClassVar[dict[str, tuple[Any, Any, Any]]] = {}
-    """Key -> its value at each effort (quick, normal, paper), for a section that a package brings."""
+    """Key -> its value at each effort (quick, normal, paper), for sections of packages."""
 
     def section(self, kind: type[S]) -> S:
-        """The section of this type. Raises LookupError."""
+        """The subsection of this type. Raises LookupError."""
         for value in vars(self).values():
             if isinstance(value, kind):
                 return value
         raise LookupError(f"{type(self).__name__} has no section {kind.__name__}")
 
     def expand(self, config: S) -> S:
-        """The configuration with what this section of it stands for, of a section at its top level. Raises InputError."""
+        """Expand a top-level section: the configuration with the scenarios, pools and transfers that it implies.
+
+        Raises InputError.
+        """
         return config
 
     @classmethod
     def completed(cls, given: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The given values, with those that follow from them."""
+        """The given values, with values derived from them."""
         return given

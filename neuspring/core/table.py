@@ -1,4 +1,4 @@
-"""A table is one value, laid out as terminal text, Markdown, LaTeX or HTML by `lay_out`."""
+"""Tables as values, and their layout as terminal text, Markdown, LaTeX or HTML."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Cell:
     mark: Literal["", "best", "second"] = ""
     tone: Tone = ""
     value: float | str | None = None
-    """Sorting key of the column; None: the text."""
+    """Sorting key within the column; None: the text."""
     wrap: bool = False
-    """May take several lines."""
+    """Whether the text may be wrapped."""
     link: str = ""
 
 
@@ -61,10 +61,10 @@ class Table:
 
 
 def lay_out(table: Table, form: Form, label: str = "") -> str:
-    """The table in one of four forms; `label` names the float in LaTeX, which needs booktabs and graphicx."""
-    change = {"latex": tex, "html": coded, "markdown": lambda text: text.replace("|", "\\|").replace("\n", " ")}.get(form, str)
-    head = [str(change(text)) for text in table.header]
-    rows = [[CELL_MARKS[form][cell.mark].format(change(cell.text)) for cell in row] for row in table.rows]
+    """The table in one of four forms; `label` is the LaTeX label. The LaTeX form needs booktabs and graphicx."""
+    escaped = {"latex": tex, "html": coded, "markdown": lambda text: text.replace("|", "\\|").replace("\n", " ")}.get(form, str)
+    head = [str(escaped(text)) for text in table.header]
+    rows = [[CELL_MARKS[form][cell.mark].format(escaped(cell.text)) for cell in row] for row in table.rows]
     if form == "html":
         return _html(table, head, rows)
     if form == "latex":
@@ -115,6 +115,6 @@ def coded(text: str) -> Markup:
 
 
 def tex(text: str) -> str:
-    """Plain text for LaTeX: special characters escaped, minus signs in mathematics."""
+    """Plain text for LaTeX: special characters are escaped, minus signs are in math mode."""
     escaped = "".join(TEX.get(character, character) for character in text)
     return re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", escaped)

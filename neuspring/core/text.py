@@ -1,4 +1,4 @@
-"""Text for the terminal: addresses of stores without their passwords, the line of progress of long work."""
+"""Text for the terminal: URIs without passwords, lists of names, numbers with units, the progress line."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from pathlib import Path
 
 
 def masked(text: str) -> str:
-    """Text without the user and password of any URI in it."""
+    """The text with user and password of every URI replaced by ***."""
     return re.sub(r"://[^/@\s]+@", "://***@", text)
 
 
 def program(name: str) -> str:
-    """A program of the environment that runs now, as it is typed in this folder."""
-    place, here = Path(sys.executable).parent / name, Path.cwd()
-    return str(place.relative_to(here) if place.is_relative_to(here) else place)
+    """Path of a program of the current environment, relative to the current folder if possible."""
+    path, here = Path(sys.executable).parent / name, Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def listed(names: Iterable[object], most: int = 12) -> str:
-    """The names, separated by commas; of more than `most` the first ones, and how many others there are."""
+    """The names, separated by commas; beyond `most` names, only the number of the others."""
     texts = [str(name) for name in names]
     return ", ".join(texts) if len(texts) <= most else f"{', '.join(texts[:most])} and {len(texts) - most} more"
 
 
 def spans(numbers: Sequence[int]) -> str:
-    """Ascending numbers in few words: `6, 13, 20 to 25`."""
+    """Ascending numbers as ranges: `6, 13, 20 to 25`."""
     runs = [[number for _, number in part] for _, part in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0])]
     return listed((f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs), 6)
 
 
 def readable(value: float, unit: str) -> tuple[float, str]:
-    """A value and its unit for reading: four significant digits, lengths in mm."""
+    """A value and its unit for display: four significant digits, lengths in mm."""
     value, unit = (1e3 * value, "mm") if unit == "m" else (value, unit)
     return float(f"{value:.4g}"), unit
 
 
 def duration(seconds: float) -> str:
-    """A time for people."""
+    """A duration as text, in s, min or h."""
     if not math.isfinite(seconds):
         return "–"
     minutes = f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
@@ -49,13 +49,13 @@ def duration(seconds: float) -> str:
 
 
 def refuse_password(key: str, uri: str, instead: str) -> None:
-    """Raise ValueError if a URI holds a password: command lines and logs of jobs would show it."""
+    """Raise ValueError if a URI contains a password, because command lines and logs of jobs would show it."""
     if ":" in uri.partition("://")[2].partition("/")[0].rpartition("@")[0]:
-        raise ValueError(f"{key}: a password would be shown by ps and in logs; set {instead} instead")
+        raise ValueError(f"{key}: must not contain a password, because ps and logs would show it; set {instead} instead")
 
 
 class Progress:
-    """Reports `label done/total` with the elapsed and remaining time, at most every `every` seconds."""
+    """Prints `label done/total` with elapsed and remaining time, at most every `every` seconds."""
 
     def __init__(self, label: str, total: int, every: float | None = None) -> None:
         self._label, self._total = label, total
@@ -66,12 +66,12 @@ class Progress:
         self._first: int | None = None
 
     def of(self, done: int, total: int) -> None:
-        """As `update`, of work whose size is known when it begins."""
+        """Set the total, then `update`: for work whose size is unknown before it starts."""
         self._total = total
         self.update(done)
 
     def update(self, done: int, note: str = "") -> None:
-        """`done` of `total` steps are finished."""
+        """Report that `done` of `total` steps are finished."""
         moment = time.monotonic()
         if self._first is None:
             self._first = done - 1

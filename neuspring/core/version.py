@@ -1,3 +1,3 @@
-"""The version; pyproject.toml reads it, and so does whatever writes it into a file."""
+"""The version of the package, which pyproject.toml reads."""
 
 __version__ = "0.6.0"

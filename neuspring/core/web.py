@@ -1,7 +1,7 @@
-"""Requests that a local server answers: those of the page that it gave out.
+"""Checks of HTTP requests: a local server answers only requests of its own pages.
 
-A page of another site can make a browser send requests here, and can point a name of its own at this address (DNS rebinding). So
-the Host header must name this machine, and what a browser says about a request's origin must agree with it.
+A page of another site can make a browser send requests to this server, also under its own host name (DNS rebinding). Therefore
+the Host header must name this machine, and the origin that the browser reports must match the Host header.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
 class Refused(Exception):
-    """A request that is not answered: an HTTP status and a sentence."""
+    """A rejected request: an HTTP status and a sentence."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -26,20 +26,20 @@ class Refused(Exception):
 
 
 def is_loopback(host: str) -> bool:
-    """True where an address or name means this machine alone."""
+    """True if an address or name is reachable only from this machine."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
 
 
 def open_page(url: str) -> None:
-    """Open an address in the user's browser, where there is a display."""
-    # Without a window webbrowser may start a text browser in this terminal.
+    """Open an address in the user's browser if there is a display."""
+    # Without a display, webbrowser may start a text browser in this terminal.
     if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(url)
 
 
 def check_host(header: str | None, bound: str) -> None:
-    """Refuse a Host header that is not a name of this machine; `bound` is the address that the server listens at."""
+    """Raise Refused if the Host header does not name this machine; `bound` is the address on which the server listens."""
     try:
         name = urlsplit(f"//{header}").hostname if header else None
     except ValueError:
@@ -54,11 +54,11 @@ def check_host(header: str | None, bound: str) -> None:
 
 
 def check_origin(headers: Mapping[str, str]) -> None:
-    """Refuse what a browser sends for a page of another site."""
+    """Raise Refused for a request that a browser sends for a page of another site."""
     origin, site = headers.get("Origin"), headers.get("Sec-Fetch-Site")
     foreign = origin is not None and urlsplit(origin).netloc.lower() != (headers.get("Host") or "").lower()
     if foreign or site not in (None, "same-origin", "none"):
-        raise Refused(403, "Requests of other sites are refused.")
+        raise Refused(403, "Requests from other sites are refused.")
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

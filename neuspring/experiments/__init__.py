@@ -1,8 +1,7 @@
-"""Many runs: from a configuration to the jobs that make it.
+"""The workflow behind the Snakefile: from a configuration to its jobs.
 
-- `benchmark`: the configuration with the rows of its tables, checked; `graph`: what the rules ask about a job, and
-  about jobs that look at many runs; `needs`: GPUs, memory and time of jobs.
-- `messages`: what a user is told while the workflow runs and afterwards.
-- `jobs`: the wrapper of every job, GPU leases, causes of failure, the warm process.
+- `benchmark`: the configuration with its table rows, checked; `graph`: the jobs and their digests; `tasks`: jobs over many runs.
+- `plan`: the plan before the first job; `messages`: messages during and after a run; `claim`: one run per results folder.
+- `job`: the wrapper of every job; `gpus`: GPU leases; `local`: the workflow's command on this machine.
 - `tracking`: MLflow, an index of the run records.
 """

@@ -1,6 +1,6 @@
-"""A run claims its results folder, so that no other run replaces what it makes.
+"""Exclusive use of a results folder by one run of the workflow.
 
-The claim is a lock of the kernel on a file that says who holds it. It ends with the process, however that ends.
+A claim is a kernel lock on a file that names its holder. It ends with the process, also if the process is killed.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from neuspring.core.lock import try_lock
 from neuspring.core.records import now
 
 CLAIMS: list[IO[str]] = []
-"""Open files: closing one would end its claim."""
+"""Open files of claims: closing a file would end its claim."""
 
 
 def claim(results: Path, settings: str) -> None:
-    """Claim a results folder for a run of these settings until this process ends.
+    """Claim a results folder for a run with these settings until this process ends.
 
-    Raises InputError where another run holds it. A file system without locks has no claims, which a warning says.
+    Raises InputError if another run holds the claim. On a file system without locks it only prints a warning.
     """
     path = results / FOLDER / "run.lock"
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         file = try_lock(path)
     except OSError as error:
-        print(f"warning: {path} cannot be locked ({error.strerror}): start no second run with results={results}.", flush=True)
+        print(f"warning: {path} cannot be locked ({error.strerror}); start no second run with results={results}.", flush=True)
         return
     if file is None:
         raise _held(results, path, settings)
@@ -45,8 +45,8 @@ def _held(results: Path, path: Path, settings: str) -> InputError:
         holder = json.loads(path.read_text())
     except (OSError, ValueError):
         holder = {}
-    alike = "the same" if holder.get("settings") == settings else "other"
-    who = f"process {holder.get('pid')} on {holder.get('host')} since {holder.get('since')}, with {alike} settings"
+    kind = "the same" if holder.get("settings") == settings else "other"
+    who = f"process {holder.get('pid')} on {holder.get('host')} since {holder.get('since')}, with {kind} settings"
     return InputError(
-        results, "one run at a time works in a results folder", who, "Wait for its end, or use --config results=OTHER_FOLDER."
+        results, "only one run at a time may use a results folder", who, "Wait for its end, or use --config results=OTHER_FOLDER."
     )

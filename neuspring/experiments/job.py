@@ -1,7 +1,7 @@
-"""One job of the workflow: leases its GPUs, runs its steps, and writes its record.
+"""The wrapper of every job of the workflow: lease GPUs, run the steps, write the job record.
 
-A step whose record agrees with its settings, code and inputs is skipped: a changed setting of lifting does not segment again, and
-a job that was killed goes on where it stopped. Nothing heavy is imported before the GPUs are chosen.
+A step is skipped if its record agrees with its settings, code and inputs. So a changed setting of `lift` does not repeat
+`segment`, and a killed job resumes. Nothing heavy is imported before the GPUs are chosen.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from neuspring.experiments.tasks import Tasks
 from neuspring.stages.stage import Job, Written
 
 POOL, GIVEN = "NEUSPRING_GPUS", "given"
-"""Environment: the devices that jobs share, separated by commas; `given`: a cluster has chosen this job's."""
+"""Environment variable: the devices that jobs share, separated by commas; `given`: a cluster has assigned the job's devices."""
 JOB_POLL = 0.5
-"""s between two looks whether an earlier run of a job has ended."""
+"""Time between two checks whether an earlier execution of a job has ended, s."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def with_gpus(benchmark: Benchmark) -> Benchmark:
-    """The benchmark, told which GPUs its jobs share: the plan and each job must see equal batches."""
+    """Set the GPUs that the benchmark's jobs share, from the environment: the plan and all jobs must compute equal batches."""
     pool, config = os.environ.get(POOL, ""), benchmark.config
     benchmark.on_gpu = config.device == "cuda" or (config.device == "auto" and bool(pool))
     benchmark.gpu_slots = len(set(pool.split(",")) - {"", GIVEN}) * config.gpus.jobs_per_gpu
@@ -57,38 +57,38 @@ def run(
     threads: int = 1,
     gpus: int = 0,
 ) -> None:
-    """Run a job of the configuration `values`; ends the process with status 2 for bad input, 1 for another error."""
+    """Run a job of the configuration `values`; exits with status 2 for invalid input and 1 for any other error."""
     graph = Graph(with_gpus(Benchmark(values, root)))
     Tasks(graph, commands, sweeps)
-    # Files are replaced as a whole, so that a job may end anywhere: it does not wait for a kernel's end.
+    # Writes are atomic, so an interrupted job may end at once, even inside a kernel.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     folder = Path(graph.results) / FOLDER / rule / name
     with logged(folder / f"{digest}.log") as say, alone(folder, say):
-        own = Runner(graph, folder / f"{digest}.log", threads)
+        runner = Runner(graph, folder / f"{digest}.log", threads)
         begun, started = time.monotonic(), now()
         try:
-            own.lease(gpus)
+            runner.lease(gpus)
             unit = graph.unit(rule, name)
             if unit.digest != digest:
-                rule_ = "settings, code and data must stay as they were when the workflow was planned"
-                raise InputError(f"job {rule} {name}", rule_, remedy="Run the same command again.")
-            own.run(unit)
-            own.note()
+                rule_ = "settings, code and data must not change after the workflow was planned"
+                raise InputError(f"job {rule} {name}", rule_, remedy="Rerun the same command.")
+            runner.run(unit)
+            runner.note()
         except Exception as error:
             if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
                 error = full_disk(Path(error.filename or graph.results))
             bad_input = isinstance(error, InputError)
             print(f"neuspring: error: {error}") if bad_input else traceback.print_exc()
             text = str(error) if bad_input else f"{type(error).__name__}: {error}".partition("\n")[0]
-            say(f"{rule} {name} failed: {text} (log: {own.log})")
-            own.note(text)
-            own.save(folder / FAILED, f"{rule}/{name}", started, begun, outcome="failed", message=text[:500])
+            say(f"{rule} {name} failed: {text} (log: {runner.log})")
+            runner.note(text)
+            runner.save(folder / FAILED, f"{rule}/{name}", started, begun, outcome="failed", message=text[:500])
             sys.exit(2 if bad_input else 1)
         say(f"{_progress(Path(graph.results))}{rule} {name}: {duration(time.monotonic() - begun)}")
 
 
 def _progress(results: Path) -> str:
-    """How many jobs of the run are done with this one, by Snakemake's benchmarks of the others."""
+    """Text with the number of finished jobs, including this one; the others are counted by Snakemake's benchmark files."""
     plan = results / FOLDER / ASKED
     if not (total := asked(results).get("jobs")):
         return ""
@@ -98,7 +98,7 @@ def _progress(results: Path) -> str:
 
 @contextlib.contextmanager
 def logged(path: Path) -> Iterator[Callable[[str], None]]:
-    """Redirect all output to a log; yields a function that tells whoever watches the workflow."""
+    """Redirect all output to a log; yields a function that prints to the terminal of the workflow."""
     path.parent.mkdir(parents=True, exist_ok=True)
     terminal = os.fdopen(os.dup(2), "w")
     with path.open("a", encoding="utf-8", buffering=1) as file:
@@ -107,7 +107,7 @@ def logged(path: Path) -> Iterator[Callable[[str], None]]:
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
 
     def say(text: str) -> None:
-        with contextlib.suppress(OSError):  # a terminal that is gone must not end the job
+        with contextlib.suppress(OSError):  # a closed terminal must not end the job
             print(text, file=terminal, flush=True)
 
     yield say
@@ -115,13 +115,13 @@ def logged(path: Path) -> Iterator[Callable[[str], None]]:
 
 @contextlib.contextmanager
 def alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Lock a job: one of a killed workflow may still be at work, and the files are the same."""
-    file = told = None
+    """Lock a job, because the same job of a killed workflow may still run and write the same files."""
+    file = reported = None
     with contextlib.suppress(OSError):  # some network file systems have no locks
         while (file := try_lock(folder / "lock")) is None:
-            if not told:
-                told = True
-                say(f"{folder.name}: an earlier run of this job is still at work; waiting for its end")
+            if not reported:
+                reported = True
+                say(f"{folder.name}: an earlier execution of this job is still running; waiting for its end")
             time.sleep(JOB_POLL)
     try:
         yield
@@ -132,7 +132,7 @@ def alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _error_of(unit: Unit, errors: dict[str, Exception]) -> Iterator[None]:
-    """Print an error and keep it: it must not stop other members of a batch."""
+    """Print an error and store it, so that it does not stop other members of a batch."""
     try:
         yield
     except Exception as error:
@@ -146,14 +146,14 @@ class Runner:
     def __init__(self, graph: Graph, log: Path, threads: int) -> None:
         self.graph, self.config, self.log = graph, graph.config, log
         for name in THREADS:
-            # A search shares its work among threads of its own.
+            # A search starts its own threads.
             os.environ[name] = "1" if f"/{FOLDER}/search/" in log.as_posix() else str(threads)
         self.devices: list[str] = []
         self.notes = Path(graph.results) / FOLDER / leases.NOTES
         self.places = {"device": self.config.device, "threads": threads, "twins_per_launch": self.config.twins_per_launch}
 
     def lease(self, count: int) -> None:
-        """Hold so many GPUs until this process ends; on a cluster its scheduler has given them. A job without GPUs sees none."""
+        """Lease `count` GPUs until this process ends (on a cluster, the scheduler has assigned them); 0: hide all GPUs."""
         pool = os.environ.get(POOL, "")
         if count and pool == GIVEN:
             self.devices = list(leases.visible_devices())
@@ -166,18 +166,21 @@ class Runner:
         os.environ.update(environment)
 
     def note(self, error: str = "") -> None:
-        """Note for other jobs whether the GPUs of this one work."""
+        """Write to the notes whether the GPUs of this job work."""
         if self.devices and os.environ.get(POOL) != GIVEN and (failure := leases.failure_of(error) if error else leases.WORKS):
             with contextlib.suppress(OSError):
                 self.held.note(failure)
 
     def run(self, unit: Unit) -> None:
-        """Run a unit, or the members of a batch. Raises whatever a step raises; an error of a member is kept for its own job."""
+        """Run a unit, or the members of a batch.
+
+        Raises every exception of a step. The error of a member does not fail the batch: the member's own job raises it.
+        """
         begun, started = time.monotonic(), now()
         if not unit.members:
             self._finish(unit, self._files(unit), started, begun)
             return
-        waiting = [one for one in unit.members if not self.graph.finished(one)]
+        waiting = [member for member in unit.members if not self.graph.finished(member)]
         errors = self._together(waiting)
         for member in waiting:
             if member.name not in errors:
@@ -188,10 +191,10 @@ class Runner:
             print(f"{member.rule} {member.name} failed: {text}", flush=True)
             path = self.graph.folder(member) / FAILED
             self.save(path, f"{member.rule}/{member.name}", started, begun, outcome="failed", message=text)
-        self._finish(unit, [self.graph.record(one) for one in unit.members], started, begun)
+        self._finish(unit, [self.graph.record(member) for member in unit.members], started, begun)
 
     def _together(self, units: Sequence[Unit]) -> dict[str, Exception]:
-        """Run members of a batch; returns errors by name. A member that fails in the batch is tried once more, alone."""
+        """Run the members of a batch; returns errors by name. A member that fails in the batch is repeated once, alone."""
         ready, errors = list[Job](), dict[str, Exception]()
         for unit in units:
             with _error_of(unit, errors):
@@ -208,7 +211,7 @@ class Runner:
                         job.keep(made)
                     else:
                         traceback.print_exception(made)
-        for unit in [one for one in units if one.name not in errors]:
+        for unit in [unit for unit in units if unit.name not in errors]:
             with _error_of(unit, errors):
                 job = self.graph.job(unit.steps[0], **self.places)
                 if not job.finished:
@@ -216,7 +219,7 @@ class Runner:
         return errors
 
     def _files(self, unit: Unit) -> list[Path]:
-        """Run a unit's steps, in their order; returns the files that it made."""
+        """Run the steps of a unit in order; returns its output files."""
         if unit.run:
             return list(unit.run(self.places))
         files = []
@@ -226,14 +229,14 @@ class Runner:
             finished = job.finished
             if not finished:
                 job.run()
-            print(f"{step.stage.name}: {'finished before' if finished else duration(time.monotonic() - begun)}", flush=True)
+            print(f"{step.stage.name}: {'already finished' if finished else duration(time.monotonic() - begun)}", flush=True)
             files.append(job.output)
         if unit.rule == "run" and self.config.tracking.enabled:
             files.append(self._log_run(files))
         return files
 
     def _log_run(self, files: Sequence[Path]) -> Path:
-        """Log a run to MLflow, an index of the records: its errors fail no run."""
+        """Log a run to MLflow; errors of MLflow do not fail the run."""
         from neuspring.core.files import write_text
         from neuspring.core.run_record import RUN_RECORD
         from neuspring.experiments.tracking import log
@@ -244,7 +247,7 @@ class Runner:
         return outcome
 
     def _finish(self, unit: Unit, files: Sequence[Path], started: str, begun: float) -> None:
-        """Write the record of a finished unit, and delete those of other settings."""
+        """Write the record of a finished unit and delete older records and logs of it."""
         record = self.graph.record(unit)
         for path in record.parent.glob("*.json"):
             path.unlink()
@@ -256,7 +259,7 @@ class Runner:
         self.save(record, f"{unit.rule}/{unit.name}", started, begun, files=names, made_of=dict(unit.made_of))
 
     def save(self, path: Path, name: str, started: str, begun: float, **ended: Any) -> None:
-        """Write a job record."""
+        """Write a job record; `ended` contains its outcome or results."""
         peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
         JobRecord(
             rule=name.partition("/")[0],

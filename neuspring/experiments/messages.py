@@ -1,4 +1,4 @@
-"""Messages to a user while the workflow runs, and after it."""
+"""Messages to the user during a run of the workflow and at its end."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from neuspring.experiments.tasks import Tasks
 from neuspring.experiments.tracking.log import OUTCOME
 
 LITTLE = 2_000_000
-"""Bytes; with less a disk counts as full."""
+"""Free space, bytes, below which a disk counts as full."""
 MOST_FINDINGS = 20
-"""Warnings that are printed at the end of a run."""
+"""Maximum number of warnings at the end of a run."""
 INTERRUPTS: list[int] = []
-"""Signals with which the user has ended this run."""
+"""Interrupt signals that this run has received."""
 
 
 def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: bool) -> None:
-    """Before the first job: what the run is about is kept. Raises InputError for --cores where a cluster runs the jobs."""
+    """Before the first job: claim the results folder and store what was asked. Raises InputError for --cores on a cluster."""
     if not (local or cluster):
-        # Jobs were planned for the GPUs of this machine, which are not those of a cluster.
-        reason = "a cluster's scheduler counts cores itself, and gives each job its GPU"
-        raise InputError("--cores", reason, cores, "Leave it out; --jobs limits how many jobs there are at once.")
+        # With --cores, jobs are planned for the GPUs of this machine.
+        reason = "must not be set on a cluster, whose scheduler assigns cores and GPUs"
+        raise InputError("--cores", reason, cores, "Omit it; --jobs limits the number of simultaneous jobs.")
     config = graph.config
     claim(Path(config.results), digest_of(plain(config)))
 
@@ -55,14 +55,14 @@ def begin(graph: Graph, jobs: int, *, local: bool, cores: int | None, cluster: b
 
 
 def failed(graph: Graph, tasks: Tasks, begun: float) -> None:
-    """After a failure or an interruption: tables and report of what is finished, what failed and why, how to continue."""
+    """After a failure or an interruption: print the failed jobs with their errors, and report on the finished runs."""
     results = Path(graph.config.results)
     if INTERRUPTS:
         done = sum(not job.failed for job in read_jobs(results, damaged=[]))
         print(f"\nInterrupted. {done} finished jobs are kept in {results}. Rerun the same command to resume.", flush=True)
         return
     if shutil.disk_usage(results).free < LITTLE:
-        print(f"\n{results}: no space left on the disk. Free some space; the same command continues.", flush=True)
+        print(f"\n{results}: no space left on the disk. Free some space, then rerun the same command to resume.", flush=True)
         return
     lines = [
         f"  {job.name}: {job.message}; {results / job.log}"
@@ -74,20 +74,20 @@ def failed(graph: Graph, tasks: Tasks, begun: float) -> None:
         try:
             print(f"Report so far: {tasks.so_far(Path(graph.results) / graph.config.tables / 'so_far')}")
         except InputError as error:
-            print(f"There is no report so far: {error}")
+            print(f"No report so far: {error}")
     print("\n".join(["Failed:", *lines] if lines else []))
     print("Rerun the same command to resume." if not lines else "Fix the cause, then rerun the same command to resume.", flush=True)
 
 
 def finished(graph: Graph, begun: float) -> None:
-    """After success: the verdict, a table, what to open, where the runs are in MLflow, how long it took."""
+    """After success: print the verdict, a table, the paths of results, the MLflow command, and the duration."""
     config, folder, neuspring = graph.config, f"{graph.results}/{graph.config.tables}", program("neuspring")
     summary = Path(folder) / "summary.md"
     if summary.exists():
         print("\n" + summary.read_text().partition("\n## ")[0].removeprefix("# Scores").strip() + "\n")
         tell_findings(graph)
         page = f"{folder}/report.html"
-        print(f"Open in a browser: {page}" if Path(page).exists() else "The report is made by the target `all`.")
+        print(f"Open in a browser: {page}" if Path(page).exists() else "The target `all` makes the report.")
         print(f"All tables: {summary}. Scores, trajectories, plots: {config.results}/<scenario>/<method>/<seed>/")
     for study in graph.benchmark.studies:
         path = Path(folder) / "studies" / f"{study}.md"
@@ -95,39 +95,39 @@ def finished(graph: Graph, begun: float) -> None:
             print(f"{study}: {path}")
     if not summary.exists():
         return
-    print(f"What is behind a number: {neuspring} explain METHOD/future/TE --results {shlex.quote(config.results)}")
+    print(f"Explain a number: {neuspring} explain METHOD/future/TE --results {shlex.quote(config.results)}")
     if config.tracking.enabled:
         tracking = json.dumps({"tracking": plain(config.tracking)}, sort_keys=True)
-        place = ["--results", config.results, *(["--settings", tracking] if config.tracking.uri else [])]
+        options = ["--results", config.results, *(["--settings", tracking] if config.tracking.uri else [])]
         waiting = [path for path in run_files(graph, OUTCOME) if "logged" not in path.read_text()]
         if waiting:
             reason = waiting[0].read_text().strip()
-            print(f"{len(waiting)} runs could not be logged ({reason}). Their records wait on disk; send them:")
-            print(f"  {neuspring} sync {shlex.join(place)}")
-        print(f"Look at the runs in MLflow: {neuspring} ui {shlex.join(place)}", flush=True)
-    print(f"It took {duration(time.time() - begun)}.", flush=True)
+            print(f"{len(waiting)} runs were not logged to MLflow ({reason}). Log them later:")
+            print(f"  {neuspring} sync {shlex.join(options)}")
+        print(f"View the runs in MLflow: {neuspring} ui {shlex.join(options)}", flush=True)
+    print(f"Total time: {duration(time.time() - begun)}.", flush=True)
 
 
 def run_files(graph: Graph, name: str) -> list[Path]:
-    """Files of this name of all runs of the configuration that are there."""
+    """Existing files of this name in all runs of the configuration."""
     paths = (Path(graph.results) / unit.name / name for unit in graph.runs())
     return [path for path in paths if path.exists()]
 
 
 def tell_findings(graph: Graph) -> None:
-    """Warnings of the steps of perception on all scenarios, and of each method's fits the worst; notes are in the report."""
+    """Print the warnings of perception on all scenarios, and the worst warning of each method's fits."""
     from neuspring.report.notes import of_fits
 
-    found = [*warnings_of(Path(graph.config.results), graph.config.scenarios)]
+    warnings = [*warnings_of(Path(graph.config.results), graph.config.scenarios)]
     runs = list[RunRecord]()
     for path in run_files(graph, RUN_RECORD):
-        with contextlib.suppress(InputError):  # the tables say which are damaged
+        with contextlib.suppress(InputError):  # the tables report damaged records
             runs.append(RunRecord.load(path))
     fits = sorted(of_fits(runs), key=lambda pair: pair[1].value)
-    found += {(one.where.partition("/")[0], one.name): (name, one) for name, one in fits}.values()
-    if found:
-        print(f"Perception and fits noticed {len(found)} thing{'s' * (len(found) > 1)} that may make results worse:")
-        print("\n".join(f"  {name}: {one}" for name, one in found[:MOST_FINDINGS]))
-        if len(found) > MOST_FINDINGS:
-            print(f"  {len(found) - MOST_FINDINGS} more are in the report.")
+    warnings += {(item.where.partition("/")[0], item.name): (name, item) for name, item in fits}.values()
+    if warnings:
+        print(f"Perception and fits report {len(warnings)} warning{'s' * (len(warnings) > 1)} that may affect results:")
+        print("\n".join(f"  {name}: {item}" for name, item in warnings[:MOST_FINDINGS]))
+        if len(warnings) > MOST_FINDINGS:
+            print(f"  {len(warnings) - MOST_FINDINGS} more are in the report.")
         print()

@@ -1,6 +1,6 @@
-"""The jobs that look at many runs: tables, study, page (the report), perception_table; and those of a sweep.
+"""Jobs over many runs: tables, study, page (the report), perception_table, and the jobs of a sweep.
 
-They concern the whole configuration, whatever part of it runs now. `study` and `page` read what `tables` wrote, or the runs.
+They cover the complete configuration, independent of `only`. `study` and `page` read the output of `tables`, or the runs.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from neuspring.registry import modules
 
 TEMPLATES = Path(__file__).parents[1] / "report" / "templates"
 FILE_OPTIONS = ("results", "output", "table", "method_table", "extra_rows", "observations")
-"""Options that say where files are. They are compared by content."""
+"""Options that are paths; digests cover the content of these files instead."""
 RULES = {"tables": 10, "study": 10, "page": 20, "perception_table": 10, "tune": 2880, "sweep_report": 20}
-"""Rule -> minutes that a job may take."""
+"""Rule -> maximum duration of a job, minutes."""
 
 
 class Tasks:
-    """Units of rules that are no stages; `commands` are the functions that they call, by name.
+    """Units of rules without stages; `commands`: name -> function that they call.
 
-    `sweeps`: the module that answers for sweeps; None where its extension was left out.
+    `sweeps`: the module with the jobs of sweeps; None if its extension was removed.
     """
 
     def __init__(self, graph: Graph, commands: Mapping[str, Callable[..., Any]], sweeps: Any = None) -> None:
@@ -40,7 +40,7 @@ class Tasks:
     # --- tables and pages
 
     def tables(self, name: str = "all") -> Unit:
-        """The long table of scores, and the summary."""
+        """The long table of all scores, and the summary."""
         given: dict[str, Any] = {"output": self.folder, "baseline": self.known.compared_with, **self._runs(), **self._transfers()}
         given |= {"aims": json.dumps(plain(self.config)["aims"]), "objects": self.config.objects}
         given |= self._rows(method_table=self.config.method_table)
@@ -48,7 +48,7 @@ class Tasks:
         return self._unit("tables", name, given, self.graph.runs(), ("report.tables",), files)
 
     def perception_table(self, name: str = "all") -> Unit:
-        """Errors of perception, by category."""
+        """Errors of perception by category."""
         judged = self.graph.judged(self.whole.scenarios)
         output = self.folder / "perception.md"
         given: dict[str, Any] = {"output": output, "scenarios": json.dumps(judged)}
@@ -65,9 +65,9 @@ class Tasks:
         return self._unit("study", name, given, needs, ("report.study",), [given["output"] / f"{name}.md"], also)
 
     def page(self, name: str = "all") -> Unit:
-        """The page with everything."""
+        """The report page."""
         settings = plain(self.whole) | {"only": ""}
-        # Where MLflow and the results are concerns nothing that the report shows.
+        # The report does not depend on the locations of MLflow and of the results.
         del settings["tracking"], settings["results"]
         given: dict[str, Any] = {
             "output": self.folder / "report.html",
@@ -76,18 +76,18 @@ class Tasks:
             "tables": self.config.tables,
         }
         given |= {"baseline": self.known.compared_with, **self._transfers(), "left_out": json.dumps(self.known.whole_left_out)}
-        own = [place.partition(":")[0].removeprefix("neuspring.") for place in modules("neuspring.report.sections").values()]
+        sections = [text.partition(":")[0].removeprefix("neuspring.") for text in modules("neuspring.report.sections").values()]
         also = "".join(file_stamp(path) for path in sorted(TEMPLATES.iterdir()))
-        return self._unit("page", name, given, self.shown(), ("report.page", *own), [given["output"]], also)
+        return self._unit("page", name, given, self.shown(), ("report.page", *sections), [given["output"]], also)
 
     def shown(self, studies: Iterable[str] | None = None) -> list[Unit]:
-        """What the report shows beside the runs."""
+        """The units whose results the report shows, except runs."""
         units = [self.graph.unit("tables", "all")]
         units += [self.graph.unit("study", name) for name in (self.config.studies if studies is None else studies)]
         return units + ([self.graph.unit("perception_table", "all")] if self.graph.judged(self.config.scenarios) else [])
 
     def so_far(self, folder: Path) -> Path:
-        """Tables and report of the runs that are there, in a folder of their own; returns the page."""
+        """Make tables and report of the finished runs in `folder`; returns the path of the page."""
         unit, page = self.graph.unit("tables", "all"), self.graph.unit("page", "all")
         self._call("tables", dict(unit.options) | {"output": folder, "brief": True})
         self._call(
@@ -105,10 +105,10 @@ class Tasks:
     def _transfers(self) -> dict[str, Any]:
         return {"transfers": tuple(name for name in self.whole.transfers or {} if name in self.whole.scenarios)}
 
-    # --- a sweep: workers share one Optuna study, which is as long as the configuration says, however many there are
+    # --- a sweep: workers share one Optuna study, whose number of trials does not depend on the number of workers
 
     def tune(self, name: str) -> Unit:
-        """A worker."""
+        """A worker of the sweep."""
         jobs, folder = self._tuning()
         needs = [self.graph.unit("perceive", scenario) for scenario in self.known.tuned]
         given: dict[str, Any] = {
@@ -119,7 +119,7 @@ class Tasks:
         return self._unit("tune", name, given, needs, code, [given["output"]], jobs.rows(self.known), where=("device", "threads"))
 
     def sweep_report(self, name: str = "all") -> Unit:
-        """The results of a sweep. Raises InputError if the configuration has none."""
+        """The results of the sweep. Raises InputError if the configuration contains no sweep."""
         jobs, folder = self._tuning()
         assert self.config.tune
         given: dict[str, Any] = {"settings": jobs.settings(self.known), "output": folder / "summary.md"}
@@ -129,10 +129,10 @@ class Tasks:
     def _tuning(self) -> tuple[Any, Path]:
         if not self.config.tune:
             remedy = "Add the section `tune` (config/README.md, config/studies/tune.yaml)."
-            raise InputError("configuration, tune", "the target sweep needs a sweep", None, remedy)
+            raise InputError("configuration, tune", "is required for the target sweep", None, remedy)
         if self.sweeps is None:
-            rule, remedy = "a sweep needs the extension neuspring/extensions/tuning", "Restore its folder, or leave tune out."
-            raise InputError("configuration, tune", rule, "left out", remedy)
+            rule, remedy = "requires the extension neuspring/extensions/tuning", "Restore its folder, or remove `tune`."
+            raise InputError("configuration, tune", rule, "a removed extension", remedy)
         return self.sweeps, self.results / "tune" / self.config.tune.study
 
     # --- common parts
@@ -148,11 +148,12 @@ class Tasks:
         also: str = "",
         where: Sequence[str] = (),
     ) -> Unit:
-        told = {key: value for key, value in given.items() if key not in FILE_OPTIONS}
+        plain_options = {key: value for key, value in given.items() if key not in FILE_OPTIONS}
         tables = [file_stamp(path) for key in ("table", "method_table") if (path := given.get(key))]
         tables += [file_stamp(path) for path in given.get("extra_rows", ())]
         digest = code_digest(*(module if module.startswith("neuspring.") else f"neuspring.{module}" for module in code))
-        made_of = {rule: {"options": told, "code": digest, "data": [*tables, also], "inputs": [one.digest for one in needs]}}
+        inputs = [unit.digest for unit in needs]
+        made_of = {rule: {"options": plain_options, "code": digest, "data": [*tables, also], "inputs": inputs}}
         command = {"page": "report", "sweep_report": "tune-report"}.get(rule, rule.replace("_", "-"))
         options = dict(given) if rule in ("tune", "sweep_report") else {"results": self.results, **given}
 

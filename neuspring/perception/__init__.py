@@ -1,16 +1,15 @@
-"""Raw RGBD video -> observations. README.md here is the page for users.
+"""Perception: raw RGBD video -> observations. README.md is the page for users.
 
 | step | modules |
 |---|---|
-| segment | `segment_given`, `segment_opencv`, `segment_sam2`, `marks`: which pixels show the object and the hands |
-| track | `track_opencv`, `track_cotracker`: where the pixels of frame 0 go |
-| lift | `lift`: tracks of all cameras -> points in the world; `controllers`: which points of the hands move the object, and when |
-| shape prior | `shape` (visual hull, a mesh from elsewhere, or none): what no camera sees |
+| segment | `segment_given`, `segment_opencv`, `segment_sam2`, `marks`: the pixels of the object and of the hands |
+| track | `track_opencv`, `track_cotracker`: the pixels of frame 0 over time |
+| lift | `lift`: tracks of all cameras -> points in the world; `controllers`: points of hands that move the object, and grasps |
+| shape prior | `shape` (visual hull, given mesh, or none): the surface that no camera sees |
 | sample | `sample`: the structure points of a twin, and observations |
-| color alone | `color`, `color_hands`: lift and shape prior of one camera without depth |
-| look | `figures`: pictures |
+| inspection | `figures` |
 
-`backends`: `SEGMENTERS` and `TRACKERS` declare the backends. What the steps hand on (`Masks`, `PixelTracks`, `LiftedTracks`,
-`ShapePrior`) is in `neuspring.data.results`, and what they notice about it in `neuspring.checks`. `marks`: masks from a few marks
-of a user.
+`backends` declares the backends: `SEGMENTERS`, `TRACKERS` and `LIFTERS`. `neuspring.data.results` defines the results (`Masks`,
+`PixelTracks`, `LiftedTracks`, `ShapePrior`), and `neuspring.checks` their checks. `film` and `masks` carry a user's
+annotations (`marks`) through a video. The extension `color_alone` lifts videos of one color camera without depth.
 """

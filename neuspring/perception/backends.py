@@ -1,8 +1,8 @@
-"""The backends of segmentation, tracking and lifting: `SEGMENTERS`, `TRACKERS` and `LIFTERS` declare them.
+"""The backends of segmentation, tracking and lifting, declared by `SEGMENTERS`, `TRACKERS` and `LIFTERS`.
 
-To add a backend: its module with the function `segment`, `track` or `lift`, and its line here; its settings, if it has some, in
-neuspring/config/perception.py. A package adds one, a `Backend`, by an entry point of the group `neuspring.segmenters`,
-`neuspring.trackers` or `neuspring.lifters`. The word `depth` of a capture names its lifter.
+To add a backend, write a module with the function `segment`, `track` or `lift`, and add its line here. Its settings go to
+neuspring/config/perception.py. Another package adds a `Backend` by an entry point of the group `neuspring.segmenters`,
+`neuspring.trackers` or `neuspring.lifters`. The key `depth` of a capture names its lifter.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Lifted:
-    """What a lifter knows of object and hands in the world."""
+    """Result of a lifter: object and controllers in the world."""
 
     tracks: LiftedTracks
     prior: ShapePrior
     findings: Sequence[Finding]
     image: ImageObservations | None = None
-    """Evidence in the image, for losses that read it."""
+    """Image evidence, for losses in the image plane."""
     depths: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Supposed depth of frame 0 [H, W], m, by camera, in place of a measured one."""
+    """Assumed depth of frame 0 [H, W], m, by camera, if none was measured."""
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Images to look at, RGB [H, W, 3], by the names of their files."""
+    """Figures, RGB [H, W, 3], by file name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """One way to do a step. Its module is imported when it is used."""
+    """One implementation of a step. Its module is imported on first use."""
 
     module: str
     section: str = ""
-    """Settings of a segmentation: a field of `perception.segment`; empty: it has none. A tracker is given `perception.track`."""
+    """Field of `perception.segment` with the settings of a segmenter; empty: none. Trackers receive `perception.track`."""
     gpu: bool = False
-    """True where it takes a GPU where there is one; it is then given the device as its last argument."""
+    """True if it uses a GPU when available; it then receives the device as its last argument."""
     truth: bool = False
-    """True where it reads the truth of a synthetic scene: for measuring perception; no method may use it."""
+    """True if it reads the truth of a synthetic scene, to measure perception; no method may use it."""
     needs: tuple[str, ...] = ()
-    """Streams of a capture that it reads besides color, `Capture.streams`."""
+    """Streams of a capture that it requires besides color, see `Capture.streams`."""
     file: str = ""
-    """File of a capture that it reads; its module checks the content: `require(capture)`."""
+    """File of a capture that it requires; `require(capture)` of its module checks the content."""
 
     def require(self, folder: Path) -> None:
-        """Raise InputError where a capture lacks what it needs, before any job runs. Damaged ones fail their own jobs."""
+        """Raise InputError if a capture misses an input, before any job runs. A damaged capture passes; its jobs fail."""
         from neuspring.data.capture import Capture
 
         try:
@@ -71,18 +71,18 @@ class Backend:
         self.require_of(capture)
 
     def require_of(self, capture: Capture) -> None:
-        """Raise InputError where a capture lacks a stream or the file that it needs."""
-        if lacking := [stream for stream in self.needs if stream not in capture.streams]:
-            rule = f"perception.segment.backend needs {', '.join(lacking)} of every frame"
-            remedy = f"Draw masks with `neuspring annotate {capture.folder}`, or choose another backend."
-            raise InputError(capture.folder, rule, f"a capture of {', '.join(sorted(capture.streams))}", remedy)
+        """Raise InputError if a capture misses a required stream or file."""
+        if missing := [stream for stream in self.needs if stream not in capture.streams]:
+            rule = f"perception.segment.backend requires {', '.join(missing)} in every frame"
+            remedy = f"Annotate the capture with `neuspring annotate {capture.folder}`, or choose another backend."
+            raise InputError(capture.folder, rule, f"a capture with {', '.join(sorted(capture.streams))}", remedy)
         if self.file:
             import_module(self.module).require(capture)
 
     def segment(self, capture: Capture, camera: str, settings: Perception, device: str) -> np.ndarray:
-        """Labels [T, H, W] uint8 of one camera: 0 table, 1 object, 2 hands, 3 person (`data.capture.OBJECT`, ...).
+        """Labels [T, H, W] uint8 of one camera: 0 nothing, 1 object, 2 hands, 3 person (`data.capture.OBJECT`, ...).
 
-        Raises InputError where the capture lacks what it needs.
+        Raises InputError if the capture misses an input.
         """
         self.require_of(capture)
         labels: np.ndarray = self._call("segment", (capture, camera, *self._settings(settings)), device)
@@ -91,27 +91,27 @@ class Backend:
     def carry(
         self, capture: Capture, camera: str, marks: Sequence[Mark], settings: Perception, device: str, progress: Progress
     ) -> Carried:
-        """Labels and doubt of every frame of a camera from marks on a few. Raises InputError where they do not fit."""
+        """Labels and doubt of all frames, from annotations of a few. Raises InputError if they do not fit the capture."""
         carried: Carried = self._call("carry", (capture, camera, marks, progress, *self._settings(settings)), device)
         return carried
 
     def outline(self, capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
-        """Labels [H, W] uint8 of one frame from the marks on it. Raises InputError where no object or hand is marked there."""
+        """Labels [H, W] uint8 of one frame from its annotations. Raises InputError without an object or a hand among them."""
         labels: np.ndarray = import_module(self.module).outline(capture, camera, frame, marks)
         return labels
 
     def track(self, capture: Capture, camera: str, labels: np.ndarray, settings: Perception, device: str) -> Followed:
-        """Tracks of pixels of the masks `labels` [T, H, W]."""
+        """Tracks of pixels inside the masks `labels` [T, H, W]."""
         tracks: Followed = self._call("track", (capture, camera, labels, settings.track), device)
         return tracks
 
     def surface(self, capture: Capture) -> ShapePrior:
-        """The surface of frame 0, where the backend knows it."""
+        """The true surface of frame 0; only for backends with `truth`."""
         surface: ShapePrior = import_module(self.module).surface(capture)
         return surface
 
     def lift(self, capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
-        """Object and hands in the world, from masks and tracks by camera."""
+        """Object and controllers in the world, from masks and tracks by camera."""
         lifted: Lifted = import_module(self.module).lift(capture, masks, tracks, settings)
         return lifted
 
@@ -146,29 +146,29 @@ BACKENDS = {"segment": SEGMENTERS, "track": TRACKERS, "lift": LIFTERS}
 
 
 def segmentation(name: str, capture: Capture) -> str:
-    """The backend of a capture's segmentation where `name` is configured: that of the capture's marks in place of `opencv`.
+    """Name of the segmentation backend of a capture: `name`, except that annotations replace `opencv`.
 
-    A user who has drawn marks knows that height and color do not separate the object from the table.
+    A user annotates a capture because height and color do not separate the object from the table.
     """
-    drawn = (other for other, one in SEGMENTERS.items() if one.file and (capture.folder / one.file).exists())
-    return next(drawn, name) if name == "opencv" else name
+    annotated = (other for other, entry in SEGMENTERS.items() if entry.file and (capture.folder / entry.file).exists())
+    return next(annotated, name) if name == "opencv" else name
 
 
 def require_known(settings: Perception) -> None:
-    """Raise InputError, with the names that there are, where a configured backend is none of them."""
+    """Raise InputError, with the known names, if a configured backend is unknown."""
     for step, name in (("segment", settings.segment.backend), ("track", settings.track.backend)):
         if name not in BACKENDS[step]:
-            remedy = "Restore the folder of its extension." if name in BACKENDS[step].left_out else ""
+            remedy = "Restore the folder of its extension in neuspring/extensions." if name in BACKENDS[step].left_out else ""
             raise InputError(f"perception.{step}.backend", f"must be one of {', '.join(BACKENDS[step])}", name, remedy)
 
 
 def segmentation_keys(name: str) -> tuple[str, ...]:
-    """Keys of the configuration that a segmentation reads."""
+    """Configuration keys that a segmentation backend reads."""
     section = SEGMENTERS[name].section
     return ("perception.segment.backend", *((f"perception.segment.{section}",) if section else ()))
 
 
 def backend_modules(step: str, name: str) -> tuple[str, ...]:
-    """Modules that a backend is made of; `opencv` gives way to marks."""
-    others = [one.module for one in SEGMENTERS.values() if one.file and (step, name) == ("segment", "opencv")]
+    """Modules of a backend; `opencv` includes those of annotations, which may replace it."""
+    others = [entry.module for entry in SEGMENTERS.values() if entry.file and (step, name) == ("segment", "opencv")]
     return (BACKENDS[step][name].module, *others)

@@ -1,7 +1,7 @@
-"""Which points of the hands move the object, and when they hold it.
+"""Controllers: the points of the hands that move the object, and their grasps.
 
-Controllers are seen throughout and spread over the hands, or lie where hands grip and move rigidly. Hands let go, and take hold
-again.
+Controllers are tracked points that are spread over the hands, or points near the object that move rigidly with their hand. Hands
+can release the object and grasp it again.
 """
 
 from __future__ import annotations
@@ -21,34 +21,37 @@ from neuspring.core.errors import InputError
 from neuspring.core.geometry import farthest
 
 MOST_CONTROLLERS = 30
-"""Largest number of controller points."""
+"""Largest number of controllers."""
 GRASP_REACH = 0.03
-"""m by which controllers of `grip: patch` may lie farther from the object than a hand's nearest point in frame 0."""
+"""m: with `grip: patch`, controllers are at most this much farther from the object than the hand's nearest point in frame 0."""
 HAND_GAP = 0.04
-"""m: a point nearer than this to a point of a hand belongs to that hand."""
+"""m: points closer than this belong to the same hand."""
 LEAST_FOR_POSE = 3
-"""Points that a rigid motion needs."""
+"""Smallest number of points that determine a rigid motion."""
 ALWAYS = np.zeros((0, 0), dtype=bool)
-"""All controllers hold in all frames."""
+"""Empty array: all controllers hold the object in all frames."""
 RELEASE_AFTER = 10
-"""Frames without any hand in view after which hands have let go, and the fewest that a hand is away."""
+"""Frames without a hand in view after which hands count as released, and shortest release, frames."""
 HAND_CELL = 0.01
-"""m: pixels of hands in one cube count once where pieces of them are sought."""
+"""m: side of the cells in which hand pixels are merged before they are grouped into pieces."""
 LEAST_OF_HAND = 20
-"""Pixels of a hand near the object that are not noise of a mask."""
+"""Smallest number of hand pixels near the object that is not mask noise."""
 GRIP_GUIDES = 5
-"""Followed points of the object that say which part of it is near a hand."""
+"""Tracked points of the object that locate the part of it near a hand."""
 
 
 def choose_controllers(
     points: np.ndarray, visible: np.ndarray, valid: np.ndarray, cloud: np.ndarray, settings: Lift, where: str
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Controllers [T, C, 3], m, and facts about them, of hand tracks [T, n, 3] and the object's points of frame 0 `cloud` [P, 3].
+    """Choose controllers [T, C, 3], m, from hand tracks [T, n, 3] and the object's points in frame 0 `cloud` [P, 3]; with facts.
 
-    `controller_gaps: none`, as released: points visible in all frames whose motion never disagrees. `rigid`: points seen in at
-    least `controller_share` of the frames; where one is not seen it goes where the rigid motion of its hand takes it. At most
-    MOST_CONTROLLERS points, each the farthest from those before. `grip: patch` takes them from `patches` instead. Raises
-    InputError if fewer than `least_controllers` remain.
+    - `controller_gaps: none`, as released: points that are visible in all frames and whose motion never disagrees.
+    - `controller_gaps: rigid`: points seen in at least `controller_share` of the frames; gaps follow the rigid motion of the
+      hand.
+    - `grip: patch`: points of `patches`.
+
+    At most MOST_CONTROLLERS points are kept, by farthest point sampling. Raises InputError if fewer than `least_controllers`
+    remain.
     """
     eligible, filled = visible.all(axis=0) & valid[:-1].all(axis=0), 0.0
     trusted = visible & np.concatenate([visible[:1], valid[:-1]])
@@ -67,11 +70,11 @@ def choose_controllers(
         candidates = points[:, eligible]
     if candidates.shape[1] < settings.least_controllers:
         if settings.grip == "patch":
-            rule = f"at least {settings.least_controllers} points of the hands must lie near the object in frame 0"
-            remedy = "perception.lift has least_controllers."
+            rule = f"at least {settings.least_controllers} points of the hands must be near the object in frame 0"
+            remedy = "Check the masks of the hands, or lower perception.lift.least_controllers."
         else:
-            rule = f"at least {settings.least_controllers} points of the hands must be followed through the video"
-            remedy = "Look at the overlay of tracks; perception.lift has controller_gaps, controller_share and least_controllers."
+            rule = f"at least {settings.least_controllers} points of the hands must be tracked through the video"
+            remedy = "Check tracks.png, or change controller_gaps, controller_share or least_controllers of perception.lift."
         raise InputError(where, rule, f"{candidates.shape[1]} of {visible.shape[1]}", remedy)
     controllers = candidates[:, farthest(candidates[0], MOST_CONTROLLERS)]
     facts |= {"controllers": float(controllers.shape[1]), "hand_tracks_kept": float(count), "controllers_filled": filled}
@@ -79,12 +82,12 @@ def choose_controllers(
 
 
 def patches(points: np.ndarray, trusted: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
-    """The points of each hand that are near the object in frame 0, moving rigidly with their hand: [T, n', 3], m; and how far
-    trusted points are from that motion, m (root mean square).
+    """Points of the hands near the object in frame 0, moved rigidly with their hand [T, n', 3], m; and the misfit, m.
 
-    A point at distance d from `cloud` is near if d <= GRASP_REACH + the least such distance of its hand: a hand that has yet to
-    come grips with what is foremost. A hand's motion is that of its trusted points, as in `fill_rigidly`; all others follow it too,
-    so the fingertips that are hidden later still grip.
+    A point at distance d from `cloud` is near if d <= GRASP_REACH + (smallest distance of its hand), so that a hand that arrives
+    later grasps with its foremost part. The trusted points of a hand determine its motion, as in `fill_rigidly`, and all its
+    points follow it: fingertips that are hidden later still grasp. The misfit is the RMS distance of trusted points from that
+    motion.
     """
     rigid = fill_rigidly(points, np.zeros_like(trusted), trusted)
     distance = cKDTree(cloud).query(points[0])[0]
@@ -94,10 +97,10 @@ def patches(points: np.ndarray, trusted: np.ndarray, cloud: np.ndarray) -> tuple
 
 
 def fill_rigidly(points: np.ndarray, kept: np.ndarray, trusted: np.ndarray | None = None) -> np.ndarray:
-    """Points [T, n, 3] with the entries that are not `kept` [T, n] replaced by the rigid motion of their hand from frame 0.
+    """Points [T, n, 3]; entries that are not `kept` [T, n] follow the rigid motion of their hand from frame 0.
 
-    The motion of a frame is the least-squares one of the hand's points that are `trusted` [T, n] (those that are kept); with fewer
-    than three it is that of the last frame that had them.
+    The motion in a frame is the least-squares fit to the hand's `trusted` points [T, n], by default the kept ones. With fewer
+    than three trusted points, the motion of the last frame is used.
     """
     trusted = kept if trusted is None else trusted
     result = points.copy()
@@ -114,15 +117,17 @@ def fill_rigidly(points: np.ndarray, kept: np.ndarray, trusted: np.ndarray | Non
 
 
 def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[Rotation, np.ndarray]:
-    """Rotation R and shift t of least squares with target = R source + t (Kabsch)."""
+    """Least-squares rotation R and translation t with target = R source + t (Kabsch)."""
     center, goal = source.mean(axis=0), target.mean(axis=0)
     rotation, _ = Rotation.align_vectors(target - goal, source - center)
     return rotation, goal - rotation.apply(center)
 
 
 def hands_of(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points [n, 3] of each hand. Hands lie HAND_GAP or more apart; a piece too small to have a pose belongs to the
-    nearest hand."""
+    """Indices of the points [n, 3] of each hand: clusters at least HAND_GAP apart.
+
+    A cluster with too few points for a pose belongs to the nearest hand.
+    """
     pairs = cKDTree(points).query_pairs(HAND_GAP, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     count, labels = connected_components(graph, directed=False)
@@ -135,42 +140,44 @@ def hands_of(points: np.ndarray) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SeenBody:
-    """Evidence of the object, and of the hands in the masks, in the training frames."""
+    """Observed object, and hands in the masks, in the training frames."""
 
     clouds: Sequence[np.ndarray]
-    """Points of the object that cameras see in each frame [P_t, 3], m."""
+    """Visible points of the object in each frame [P_t, 3], m."""
     hands: Sequence[np.ndarray]
-    """Points of all hands that cameras see in each frame [H_t, 3], m."""
+    """Visible points of all hands in each frame [H_t, 3], m."""
     points: np.ndarray
-    """Followed points [T, n, 3], m."""
+    """Tracked points of the object [T, n, 3], m."""
     visible: np.ndarray
     """[T, n] bool."""
 
 
 @dataclass(frozen=True, eq=False)
 class Grips:
-    """When controllers hold, and hands that none of them stands for."""
+    """Grasps of the controllers, and hands without controllers."""
 
     holds: np.ndarray
-    """[T, C] bool; `ALWAYS` if all hold in all frames."""
+    """[T, C] bool: the controller holds the object; `ALWAYS` if all do in all frames."""
     elsewhere: int | None
-    """The first frame in which a hand came back to another part of the object, which no spring joins to it."""
+    """First frame in which a hand grasps another part of the object, to which no spring connects it."""
     strays: list[int]
-    """Frames in which a hand without controllers is within `release` of the body."""
+    """Frames in which a hand without controllers is within `release` of the object."""
 
 
 def holding(
     controllers: np.ndarray, hands: tuple[np.ndarray, np.ndarray], body: SeenBody, in_view: np.ndarray, release: float
 ) -> Grips:
-    """When each of `controllers` [T, C, 3] holds, and where pixels of hands have no controllers.
+    """Find the frames in which each of `controllers` [T, C, 3], m, holds the object, and hands without controllers.
 
-    `hands` are tracked points [T, n, 3], m, and whether they are seen [T, n]; `in_view` [T]: whether any mask shows a hand. The
-    body is known in the training frames: later a hand lets go only by leaving the view, and takes no hold.
+    Args: `hands`: tracked points [T, n, 3], m, and their visibility [T, n]; `in_view` [T]: some mask shows a hand; `release`, m.
 
-    A hand lets go after a frame in which it was within `release`, m, of the body: as soon as it is seen farther away, or when no
-    hand was in view for RELEASE_AFTER frames. If it is near again fewer than RELEASE_AFTER frames later it has not let go. Later it
-    takes hold again, if the part of the body that it is near lay within `release` of its controllers in frame 0, where springs are
-    made; else it holds nothing any more.
+    - A hand releases the object when it is seen farther than `release` from it, or when no hand is in view for RELEASE_AFTER
+      frames.
+    - A hand that is near again within RELEASE_AFTER frames did not release the object.
+    - A later grasp counts only if that part of the object was within `release` of the hand's controllers in frame 0, because
+      springs are made in frame 0. After a grasp of another part, the hand holds nothing.
+    - The object is observed only in training frames. In future frames, a hand releases only by leaving the view, and never
+      grasps.
     """
     points, seen = hands
     label = np.zeros(points.shape[1], dtype=int)
@@ -182,7 +189,7 @@ def holding(
     for frame, (cloud, pixels) in enumerate(zip(body.clouds, body.hands, strict=True)):
         if not len(cloud):
             continue
-        # Followed points lie anywhere on a hand, and of few of them the pose is rough: what masks show of it counts too.
+        # Tracked points can be far from the fingers, and few give a rough pose: pixels of the mask count too.
         here, posed = np.flatnonzero(seen[frame] & np.isin(label, hand_of)), followed[hand_of, frame]
         known = np.concatenate([points[frame, here], controllers[frame, posed]])
         owner = _owners(pixels, known, np.concatenate([label[here], hand_of[posed]]))
@@ -199,7 +206,7 @@ def holding(
             valid[begin:end, members] = False
             if end == len(points):
                 break
-            # The part of the body that is near the hand now, where it was in frame 0.
+            # The part of the object that is now near the hand, at its position in frame 0.
             known = np.flatnonzero(body.visible[end] & body.visible[0])
             nearest = np.argsort(cKDTree(controllers[end, members]).query(body.points[end, known])[0], kind="stable")[:GRIP_GUIDES]
             there = cKDTree(controllers[0, members]).query(body.points[0, known[nearest]])[0]
@@ -211,10 +218,10 @@ def holding(
 
 
 def _owners(pixels: np.ndarray, known: np.ndarray, hand: np.ndarray) -> np.ndarray:
-    """The hand [P] of each pixel of hands [P, 3], m, by the `known` points [n, 3] of hand `hand` [n]; -1: of none of them.
+    """Hand index [P] of each hand pixel [P, 3], m, from `known` points [n, 3] of hand `hand` [n]; -1: another hand.
 
-    Pixels in one piece that known points lie on belong to the hand of the nearest. A piece without any is another hand: it came
-    later, or its tracks are lost.
+    In a connected piece with known points, a pixel belongs to the hand of the nearest one. A piece without known points is
+    another hand, which came later or lost its tracks.
     """
     owner = np.full(len(pixels), -1)
     if not len(pixels) or not len(known):
@@ -228,9 +235,9 @@ def _owners(pixels: np.ndarray, known: np.ndarray, hand: np.ndarray) -> np.ndarr
 
 
 def _gaps(near: np.ndarray, away: np.ndarray, in_view: np.ndarray) -> list[tuple[int, int]]:
-    """Frames [begin, end) in which a hand that was `near` [T] holds no more: until it is near again, or T.
+    """Frame ranges [begin, end) in which a hand that was `near` [T] does not hold: until it is near again, or until T.
 
-    It is gone in the first frame in which it is `away` [T], or out of view for RELEASE_AFTER frames.
+    A range begins when the hand is `away` [T], or after RELEASE_AFTER frames out of view.
     """
     gaps: list[tuple[int, int]] = []
     frames = np.flatnonzero(near).tolist()

@@ -1,4 +1,4 @@
-"""Pictures of perception to look at: masks and tracks over the video, the lifted points from two sides, the shape prior."""
+"""Figures of perception: masks and tracks over the video, lifted points and shape prior from two sides."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from neuspring.data.frames import frames_of, overlay, spread, tints_of, write_pn
 from neuspring.data.results import LiftedTracks, Masks, PixelTracks, ShapePrior
 
 STRIP_FRAMES = 5
-"""Frames of a strip."""
+"""Number of frames in a strip."""
 TRAIL = 8
-"""Frames by which the tail of a track reaches back."""
+"""Length of the tail of a track, frames."""
 MOST_TRACKS = 400
 
 
 def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path:
-    """Frames of the video side by side, object and hands tinted."""
+    """Draw frames of the video side by side, with object and hands tinted. Returns the path."""
     shown = spread(frames_of(capture, camera), STRIP_FRAMES)
     tints = tints_of(capture.color(camera, shown[0]), masks.labels[shown[0]])
     tiles = [overlay(capture.color(camera, frame), masks.labels[frame], tints) for frame in shown]
@@ -29,7 +29,7 @@ def masks_strip(capture: Capture, camera: str, masks: Masks, path: Path) -> Path
 
 
 def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path) -> Path:
-    """Frames of the video with the visible points and where they came from, colored by their place in frame 0."""
+    """Draw visible points with the tails of their tracks on frames, colored by position in frame 0. Returns the path."""
     count = tracks.pixels.shape[1]
     shown = np.random.default_rng(0).permutation(count)[:MOST_TRACKS]
     hue = tracks.pixels[0, shown] @ [1.0, 0.6]
@@ -49,8 +49,10 @@ def tracks_strip(capture: Capture, camera: str, tracks: PixelTracks, path: Path)
 
 
 def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) -> Path:
-    """Frame 0 and the last frame from the side and from above: object points in their colors, controllers red, the prior gray where
-    a camera saw it and orange where it is invented."""
+    """Draw frame 0 and the last frame from the side and from above. Returns the path.
+
+    Object points have their colors, controllers are red. The prior is gray if a camera saw it, and orange if it is invented.
+    """
     from matplotlib import pyplot as plt
 
     last = len(lifted.object_points) - 1
@@ -79,7 +81,7 @@ def lifted_figure(lifted: LiftedTracks, prior: ShapePrior | None, path: Path) ->
 
 
 def _parts(prior: ShapePrior) -> list[tuple[np.ndarray, str, str]]:
-    """Vertices of the prior by how they are known: points, color, words for the legend."""
+    """Parts of the prior by whether a camera saw them: vertices, color, legend text."""
     if not len(prior.seen):
         return [(prior.vertices, "0.8", f"shape: {prior.backend}")]
     share = prior.facts.get("invented_share", float((~prior.seen).mean()))

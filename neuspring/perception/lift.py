@@ -1,7 +1,7 @@
-"""Tracks of all cameras -> points in the world: cleaned masks, visibility, agreement of motion, controllers.
+"""Tracks of all cameras -> points in the world: cleaned masks, visibility, motion agreement, controllers.
 
-After sections 2.5 to 2.7 of the processing that PhysTwin released, vectorized. The released result depends on the order of points,
-and its outlier test looks at single coordinates; ours does neither.
+A vectorized version of sections 2.5 to 2.7 of PhysTwin's released processing. Unlike the released code, the result does not
+depend on the order of points, and the outlier test uses distances instead of single coordinates.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from neuspring.perception.controllers import ALWAYS, HAND_GAP, SeenBody, choose_
 from neuspring.perception.shape import no_prior, shape_prior
 
 NEAREST, FARTHEST = 0.2, 1.5
-"""Depth that is used, m along the optical axis, as released."""
+"""Range of usable depth, m along the optical axis, as released."""
 OUTLIER_NEIGHBORS, REFERENCE_FOCAL = 40.0, 430.0
-"""Neighbors that a masked pixel must exceed, at a focal length in pixels: a longer one shows a surface in more pixels."""
+"""A masked pixel must have more neighbors than this at the reference focal length, pixels; scaled by the focal length squared."""
 DEPTH_WINDOW = 3
-"""Side of the window, pixels, whose median depth inside the mask a track gets."""
+"""Side of the window, pixels: a track gets the median depth inside the mask in it."""
 LEAST_NEIGHBORS = 5
-"""Smallest number of neighbors of a motion that is trusted, itself included."""
+"""Smallest number of neighbors of a trusted motion, itself included."""
 AGREEMENT = 0.005
-"""m, within which at least half of a motion's neighbors must move alike, as released."""
+"""m: at least half of a motion's neighbors must agree with it within this distance, as released."""
 NEAR_STRIDE = 3
-"""Stride among pixels of object and hands: each third says how near they are."""
+"""Every third pixel of object and hands is used for their distance."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Points of one kind over time."""
+    """Points of object or hands over time."""
 
     points: np.ndarray
-    """[T, n, 3], m; zeros where not visible."""
+    """[T, n, 3], m; zero if not visible."""
     visible: np.ndarray
     """[T, n] bool."""
     colors: np.ndarray
@@ -50,14 +50,14 @@ class Seen:
 
     @classmethod
     def of_all(cls, cameras: list[Seen]) -> Seen:
-        """Points that several cameras saw."""
+        """Concatenate the points of several cameras."""
         points = np.concatenate([camera.points for camera in cameras], axis=1)
         visible = np.concatenate([camera.visible for camera in cameras], axis=1)
         return cls(points, visible, np.concatenate([camera.colors for camera in cameras]))
 
 
 def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
-    """Tracks of cameras with depth in the world, and the shape prior where the capture brings no nodes. Raises InputError."""
+    """Lift tracks of cameras with depth; compute the shape prior unless the capture contains nodes. Raises InputError."""
     lifted = lift_tracks(capture, masks, tracks, settings.lift)
     given = len(read(capture).nodes)
     prior = no_prior() if given else shape_prior(capture, masks, lifted.cloud, settings.shape)
@@ -65,9 +65,9 @@ def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, Pixe
 
 
 def lift_tracks(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Lift) -> LiftedTracks:
-    """All tracks as points in the world, with the controllers that the capture brings, or chosen among those of the hands.
+    """Lift all tracks to the world; controllers are those of the capture, or are chosen from tracks of the hands.
 
-    Raises InputError where nothing of the object or too little of the hands remains.
+    Raises InputError if no track of the object or too few of the hands remain.
     """
     cameras = capture.cameras
     labels, cloud, colors = clean_masks(capture, masks, settings.neighborhood)
@@ -79,9 +79,9 @@ def lift_tracks(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[st
     if not objects.points.shape[1]:
         shown = sum(int((mask.labels[0] == OBJECT).sum()) for mask in masks.values())
         usable = sum(int((label[0] == OBJECT).sum()) for label in labels.values())
-        received = f"{shown} pixels of the object's masks, {usable} of them with depth in range and enough neighbors, no track"
-        remedy = f"Look at masks and tracks; depth from {NEAREST:g} to {FARTHEST:g} m is used."
-        raise InputError(where, "at least one tracked point must lie on the object in frame 0", received, remedy)
+        received = f"no track, and {shown} mask pixels of the object, {usable} of them with usable depth and enough neighbors"
+        remedy = f"Check masks.png and tracks.png; usable depth is {NEAREST:g} to {FARTHEST:g} m."
+        raise InputError(where, "at least one tracked point must be on the object in frame 0", received, remedy)
     valid = agreeing_motion(objects, settings.neighborhood)
     space = read(capture)
     if space.hands is None:
@@ -123,16 +123,16 @@ def lift_tracks(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[st
 def _body(
     capture: Capture, cameras: Mapping[str, Camera], labels: Mapping[str, np.ndarray], objects: Seen
 ) -> tuple[SeenBody, np.ndarray]:
-    """Evidence of when hands hold, and whether any mask shows a hand [T]. Depth is read again."""
+    """Evidence for grasps, and whether any mask shows a hand [T]. Reads depth again."""
     clouds: dict[int, list[np.ndarray]] = {OBJECT: [], HANDS: []}
     for frame in range(capture.train_end):
         depths = {name: capture.depth(name, frame) for name in cameras if capture.has(name, frame)}
-        for label, own in clouds.items():
+        for label, points in clouds.items():
             seen = [np.zeros((0, 3))]
             for name, depth in depths.items():
                 y, x = (values[::NEAR_STRIDE] for values in np.nonzero(labels[name][frame] == label))
                 seen.append(cameras[name].lift(np.stack([x, y], axis=1).astype(float), depth[y, x]))
-            own.append(np.concatenate(seen))
+            points.append(np.concatenate(seen))
     in_view = np.any([(label == HANDS).any(axis=(1, 2)) for label in labels.values()], axis=0)
     return SeenBody(clouds[OBJECT], clouds[HANDS], objects.points, objects.visible), in_view
 
@@ -140,15 +140,14 @@ def _body(
 def clean_masks(
     capture: Capture, masks: Mapping[str, Masks], neighborhood: float, frames: int | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Labels [T, H, W] per camera, and the object's cloud of frame 0 [P, 3], m, with its colors [P, 3].
+    """Cleaned labels [T, H, W] per camera, and the object's point cloud in frame 0 [P, 3], m, with colors [P, 3].
 
-    Labels lose the pixels that have no usable depth, and those whose points float alone. Only the first `frames` are cleaned, if
-    given.
+    Removes pixels without usable depth, and pixels whose points have too few neighbors. `frames`: clean only so many frames.
     """
     cameras = capture.cameras
     labels = {name: np.zeros_like(mask.labels) for name, mask in masks.items()}
     cloud, colors = np.zeros((0, 3)), np.zeros((0, 3))
-    # The density of the points that a camera sees on a surface goes with the square of its focal length.
+    # The density of points on a surface is proportional to the squared focal length.
     focal = {name: camera.intrinsics[0, 0] for name, camera in cameras.items()}
     least = {name: OUTLIER_NEIGHBORS * (length / REFERENCE_FOCAL) ** 2 for name, length in focal.items()}
     for frame in range(frames or capture.frame_count):
@@ -159,7 +158,7 @@ def clean_masks(
         for label in (OBJECT, HANDS):
             pixels, points = {}, []
             for name in names:
-                # A repeated image does not show where the object is.
+                # A repeated image shows the object at an old position.
                 depth = depths[name] * (label == HANDS or capture.shows(name, frame))
                 pixels[name] = np.nonzero((masks[name].labels[frame] == label) & (depth > NEAREST) & (depth < FARTHEST))
                 y, x = pixels[name]
@@ -176,7 +175,7 @@ def clean_masks(
 
 
 def agreeing_motion(seen: Seen, neighborhood: float) -> np.ndarray:
-    """[T, n] bool, row t for the motion from t to t + 1: the point is visible in both, and half of its neighbors move alike."""
+    """[T, n] bool for the motion from t to t + 1: the point is visible in both frames, and half of its neighbors agree."""
     valid = np.zeros_like(seen.visible)
     for frame in range(len(seen.points) - 1):
         if len(moving := np.flatnonzero(seen.visible[frame] & seen.visible[frame + 1])):
@@ -186,36 +185,36 @@ def agreeing_motion(seen: Seen, neighborhood: float) -> np.ndarray:
 
 
 def _agreeing(points: np.ndarray, motion: np.ndarray, neighborhood: float) -> np.ndarray:
-    """Every point judged by all others: independent of their order."""
+    """Agreement of each motion with those of all neighbors, independent of their order."""
     pairs = cKDTree(points).query_pairs(neighborhood, output_type="ndarray")
-    alike = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < AGREEMENT
+    same = np.linalg.norm(motion[pairs[:, 0]] - motion[pairs[:, 1]], axis=1) < AGREEMENT
     count = np.bincount(pairs.ravel(), minlength=len(points)) + 1
-    agreeing = np.bincount(pairs[alike].ravel(), minlength=len(points)) + 1
+    agreeing = np.bincount(pairs[same].ravel(), minlength=len(points)) + 1
     return (count >= LEAST_NEIGHBORS) & (agreeing >= 0.5 * count)
 
 
 def _lifted(capture: Capture, camera: Camera, tracks: PixelTracks, inside: np.ndarray) -> Seen:
-    """The tracks of one camera that start inside the mask `inside` [T, H, W]."""
+    """Lift the tracks of one camera that start inside the mask `inside` [T, H, W]."""
     rounded = np.round(tracks.pixels).astype(int)
     visible = tracks.visible & camera.sees(tracks.pixels)
     for frame, seen in enumerate(visible):
         x, y = rounded[frame, seen].T
         seen[seen] = inside[frame, y, x]
-    own = visible[0]
-    rounded, visible = rounded[:, own], visible[:, own]
-    places = tracks.pixels[:, own]
+    starting = visible[0]
+    rounded, visible = rounded[:, starting], visible[:, starting]
+    pixels = tracks.pixels[:, starting]
     points = np.zeros((*visible.shape, 3))
     for frame, seen in enumerate(visible):
         if seen.any():
             x, y = rounded[frame, seen].T
             depth = local_depth(capture.depth(camera.name, frame), inside[frame], x, y)
-            points[frame, seen] = camera.lift(places[frame, seen].astype(float), depth)
+            points[frame, seen] = camera.lift(pixels[frame, seen].astype(float), depth)
     x, y = rounded[0].T
     return Seen(points, visible, capture.color(camera.name, 0)[y, x] / 255.0)
 
 
 def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Median depth [n], m, of the pixels around (x, y) that belong to the same mask; (x, y) itself does."""
+    """Median depth [n], m, of the mask pixels around (x, y); (x, y) must be inside the mask."""
     reach = np.arange(DEPTH_WINDOW) - DEPTH_WINDOW // 2
     rows = np.clip(y[:, None, None] + reach[:, None], 0, depth.shape[0] - 1)
     columns = np.clip(x[:, None, None] + reach[None, :], 0, depth.shape[1] - 1)
@@ -224,7 +223,7 @@ def local_depth(depth: np.ndarray, inside: np.ndarray, x: np.ndarray, y: np.ndar
 
 
 def _crowded(points: np.ndarray, radius: float, least: np.ndarray) -> np.ndarray:
-    """The points [n] bool that have more than `least` [n] points, themselves included, within `radius` of each."""
+    """True for points [n] with more than `least` [n] points within `radius`, themselves included."""
     if not len(points):
         return np.zeros(0, dtype=bool)
     return np.asarray(cKDTree(points).query_ball_point(points, radius, return_length=True) > least)

@@ -1,4 +1,4 @@
-"""Masks of a capture: its folder mask/, the record of what made them, a sheet to look at, and comparison with others."""
+"""Masks of a capture: the folder mask/, the record of their source, a contact sheet, and comparison with other masks."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from neuspring.perception.film import Carried
 from neuspring.perception.marks import Mark, marks_digest
 
 MADE = "masks.json"
-"""Source of the masks of a capture, and how far each frame is doubted; in its folder."""
+"""File in a capture with the source of its masks and the doubt of each frame."""
 SHEET_COLUMNS = 4
 EVEN, DOUBTFUL = 8, 8
-"""Frames that are shown evenly over the video, and in doubt."""
+"""Numbers of evenly spaced and of most doubtful frames on the contact sheet."""
 TILE_WIDTH = 424
-"""Width of a tile, pixels, at most."""
+"""Largest width of a tile, pixels."""
 
 
 def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
-    """Write mask/<camera>/<frame>.png of labels [T, H, W] uint8, and `masks: true` once every camera has masks.
+    """Write mask/<camera>/<frame>.png of labels [T, H, W] uint8; set `masks: true` once every camera has masks.
 
-    Frames that the camera lacks are skipped. Returns the folder. Raises InputError where the shape or a label is wrong.
+    Missing frames are skipped. Returns the folder. Raises InputError if the shape or a label is wrong.
     """
     view = capture.cameras[camera]
     shape = (capture.frame_count, view.height, view.width)
@@ -44,10 +44,10 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
         raise InputError(
             f"masks of camera {camera}", "labels must be 0 (nothing), 1 (object), 2 (hands) or 3 (person)", int(labels.max())
         )
-    # From here on the masks are no longer what masks.json says, also if this is interrupted.
+    # Remove the record first: after an interruption, masks.json must not describe other masks.
     _write_made(capture, {name: made for name, made in MasksFile.of(capture).cameras.items() if name != camera})
     for frame in frames_of(capture, camera):
-        # A link to the original of an imported capture is replaced, and the original left alone.
+        # Replaces a link of an imported capture, and leaves its original unchanged.
         write_png(capture.path("mask", camera, frame), labels[frame])
     if has_masks(capture):
         path = capture.folder / CAPTURE
@@ -59,10 +59,10 @@ def save_masks(capture: Capture, camera: str, labels: np.ndarray) -> Path:
 
 
 def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None = None) -> Path:
-    """Save the masks of other tools as those of a camera: folders of <frame of the capture>.png, see `capture.read_labels`.
+    """Save masks of another tool as those of a camera: a folder of <frame>.png, read by `capture.read_labels`.
 
-    With `hands` all but 0 counts: in `masks` as the object, in `hands` as hands, who lie before it. Returns the folder. Raises
-    InputError.
+    With `hands`, each nonzero pixel counts: as the object in `masks`, as hands in `hands`, which occlude the object. Returns the
+    folder. Raises InputError.
     """
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), np.uint8)
@@ -70,15 +70,15 @@ def import_masks(capture: Capture, camera: str, masks: Path, hands: Path | None 
         files = {} if folder is None else _numbered(folder)
         for frame in frames_of(capture, camera) if files else ():
             if frame not in files:
-                rule = f"a mask of frame {frame} of camera {camera} is required, with its number as the name: {frame:05d}.png"
+                rule = f"a mask of frame {frame} of camera {camera} is required, named by its frame number: {frame:05d}.png"
                 raise InputError(str(folder), rule, f"frames {min(files)} to {max(files)}, {len(files)} in all")
-            found = read_labels(files[frame], view, binary=hands is not None)
-            labels[frame] = np.where(found > 0, label if hands is not None else found, labels[frame])
+            values = read_labels(files[frame], view, binary=hands is not None)
+            labels[frame] = np.where(values > 0, label if hands is not None else values, labels[frame])
     return save_masks(capture, camera, labels)
 
 
 def has_masks(capture: Capture, cameras: Sequence[str] = ()) -> bool:
-    """True where there is a mask of every frame of these cameras, all by default."""
+    """True if every recorded frame of these cameras, by default all, has a mask."""
     names = cameras or capture.cameras
     return all(capture.path("mask", name, frame).is_file() for name in names for frame in frames_of(capture, name))
 
@@ -89,10 +89,10 @@ class MadeMasks:
 
     __pydantic_config__ = STRICT
     source: str
-    """SHA-256 over backend, settings, marks and images."""
+    """SHA-256 over backend, settings, annotations and images."""
     backend: str
     doubt: tuple[float, ...]
-    """Per frame, 0 (sure) to 1."""
+    """Doubt of each frame, 0 (certain) to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,17 +105,17 @@ class MasksFile:
 
     @classmethod
     def of(cls, capture: Capture) -> MasksFile:
-        """The file of a capture; empty where there is none. Raises InputError for a damaged one."""
+        """Read masks.json of a capture; empty if the file is missing. Raises InputError for a damaged file."""
         path = capture.folder / MADE
         if not path.exists():
             return cls()
         values = load_json(path)
         if not isinstance(values, dict):
-            raise InputError(path, "a JSON object is required", type(values).__name__, "Delete it; the masks are made again.")
+            raise InputError(path, "a JSON object is required", type(values).__name__, "Delete this file; masks are made again.")
         return parse(cls, values, str(path))
 
     def holds(self, capture: Capture, camera: str, source: str) -> bool:
-        """True where the camera's masks are there and were made from this source."""
+        """True if the camera has masks that were made from this source."""
         return camera in self.cameras and self.cameras[camera].source == source and has_masks(capture, [camera])
 
 
@@ -125,7 +125,7 @@ def _write_made(capture: Capture, cameras: dict[str, MadeMasks]) -> None:
 
 
 def save_carried(capture: Capture, camera: str, carried: Carried, source: str, backend: str) -> MadeMasks:
-    """Write mask/<camera>/, the sheet to look at, and what the masks were made from: `source_digest`. Raises InputError."""
+    """Write mask/<camera>/, the contact sheet, and the record of their source (`source_digest`). Raises InputError."""
     save_masks(capture, camera, carried.labels)
     save_sheet(capture, camera, carried)
     made = MadeMasks(source=source, backend=backend, doubt=tuple(round(float(value), 4) for value in carried.doubt))
@@ -134,7 +134,7 @@ def save_carried(capture: Capture, camera: str, carried: Carried, source: str, b
 
 
 def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend: str) -> str:
-    """SHA-256 over the backend, the marks and the contents of the camera's images."""
+    """SHA-256 over the backend, the annotations and the contents of the camera's images."""
     digest = hashlib.sha256(canonical([backend, marks_digest(tuple(marks))]).encode())
     for kind in ("color", "depth"):
         for path in sorted((capture.folder / kind / camera).glob("*")):
@@ -143,12 +143,12 @@ def source_digest(capture: Capture, camera: str, marks: Sequence[Mark], backend:
 
 
 def sheet_of(capture: Capture, camera: str) -> Path:
-    """The place where the sheet of a camera lies: beside the masks."""
+    """Path of the contact sheet of a camera."""
     return capture.folder / f"mask_{camera}.png"
 
 
 def save_sheet(capture: Capture, camera: str, carried: Carried) -> Path:
-    """Write `sheet_of` a camera: the most doubtful frames first, then frames evenly spaced."""
+    """Write the contact sheet of a camera: the most doubtful frames first, then evenly spaced frames."""
     frames = frames_of(capture, camera)
     tints = tints_of(capture.color(camera, frames[0]), carried.labels[frames[0]])
     doubtful = sorted(frames, key=lambda frame: -carried.doubt[frame])[:DOUBTFUL]
@@ -171,25 +171,25 @@ def _tile(capture: Capture, camera: str, carried: Carried, tints: Mapping[int, C
 
 
 def compare(masks: Path, truth: Path) -> dict[int, tuple[float, float]]:
-    """Intersection over union of object and of hands, NaN where neither mask shows them, of all frames in `truth`.
+    """IoU of object and of hands for each frame in `truth`; NaN if neither mask shows them.
 
-    Raises InputError where masks lack one or differ in size.
+    Raises InputError if a frame is missing in `masks`, or if sizes differ.
     """
-    there, known = (_numbered(folder) for folder in (masks, truth))
+    compared, known = (_numbered(folder) for folder in (masks, truth))
     rows = {}
     for frame, path in known.items():
-        if frame not in there:
-            raise InputError(masks, f"a mask of frame {frame} is required: {truth} has one", sorted(there)[:5])
-        one, other = (read_labels(file) for file in (there[frame], path))
-        if one.shape != other.shape:
-            raise InputError(there[frame], f"must have the size of {path}", [image.shape for image in (one, other)])
-        rows[frame] = (overlap(one == OBJECT, other == OBJECT), overlap(one == HANDS, other == HANDS))
+        if frame not in compared:
+            raise InputError(masks, f"a mask of frame {frame} is required: {truth} has one", sorted(compared)[:5])
+        labels, true = (read_labels(file) for file in (compared[frame], path))
+        if labels.shape != true.shape:
+            raise InputError(compared[frame], f"must have the size of {path}", [image.shape for image in (labels, true)])
+        rows[frame] = (overlap(labels == OBJECT, true == OBJECT), overlap(labels == HANDS, true == HANDS))
     return rows
 
 
 def table(rows: dict[int, tuple[float, float]]) -> str:
-    """Text of a table: IoU per frame, and the mean."""
-    lines = ["frame  object  hands"] + [f"{frame:5d}  {found:6.3f}  {hands:5.3f}" for frame, (found, hands) in rows.items()]
+    """Table of the IoU per frame and its mean, as text."""
+    lines = ["frame  object  hands"] + [f"{frame:5d}  {toy:6.3f}  {hands:5.3f}" for frame, (toy, hands) in rows.items()]
     values = np.array(list(rows.values()))
     known = np.isfinite(values)
     means = np.where(known, values, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
@@ -197,7 +197,7 @@ def table(rows: dict[int, tuple[float, float]]) -> str:
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    found = {int(path.stem): path for path in sorted(Path(folder).glob("*.png")) if path.stem.isdigit()}
-    if not found:
-        raise InputError(folder, "a folder of masks named by their frame is required: 00000.png", "none")
-    return found
+    files = {int(path.stem): path for path in sorted(Path(folder).glob("*.png")) if path.stem.isdigit()}
+    if not files:
+        raise InputError(folder, "must contain masks named by their frame number, such as 00000.png", "no such file")
+    return files

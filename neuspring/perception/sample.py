@@ -1,7 +1,7 @@
-"""Lifted tracks and shape prior -> observations: the structure points of a twin, one per voxel, and tracks for scoring.
+"""Lifted tracks and shape prior -> observations: the nodes of a twin, one per voxel, and tracks for scores.
 
-Observed points come first, then points on the prior's surface, then points inside it (section 2.9 of the released processing, here
-with a seed).
+Observed points come first, then points on the prior's surface, then points inside it, as in section 2.9 of PhysTwin's released
+processing; here with a seed.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from neuspring.intake.points import in_both, read, scenario_of, standing, taught
 from neuspring.perception.film import PERCEPTION_SEED
 
 SURFACE, INTERIOR = 1024, 10000
-"""Points drawn on the prior's surface, and in its bounding box, of which those inside are kept; as released."""
+"""Numbers of points sampled on the prior's surface and in its bounding box, as released; only inner points are kept."""
 GROWTH = 1.01
-"""Ratio of the voxel sizes that are tried one after the other."""
+"""Ratio of successive voxel sizes in `voxel_for`."""
 
 
 def assemble(
@@ -37,13 +37,13 @@ def assemble(
     settings: Perception,
     image: ImageObservations | None = None,
 ) -> Observations:
-    """Observations for every method. Points that are invisible are zero. `image` is the evidence of color alone, of all tracks.
+    """Observations for all methods; invisible points are zero. `image`: evidence of a color camera without depth, for all tracks.
 
-    Nodes that the capture brings take the place of those that are sampled. Annotated points that teach (`tracks: train`) and are
-    seen in frame 0 come first, are seen in training frames, and have no place in the image.
+    Nodes of the capture replace sampled ones. Annotated points for training (`tracks: train`) that are visible in frame 0 come
+    first; they are visible only in training frames, and have no position in the image.
     """
     up, space = capture.description.up_sign, read(capture)
-    # In the image every node should have a track that is followed for long.
+    # Without depth, nodes should have long tracks.
     followed = None if image is None else image.visible[: capture.train_end].sum(axis=0)
     if given := len(space.nodes):
         nodes = standing(space.nodes, up)[0] if row.ground else space.nodes
@@ -92,12 +92,11 @@ def assemble(
 def structure(
     lifted: LiftedTracks, prior: ShapePrior, settings: Sampling, up: float, seed: int, rank: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Indices of the object tracks to keep [No], surface points [Ns, 3] and interior points [Ni, 3], m, and the voxel's side, m.
+    """Indices of the kept object tracks [No], surface points [Ns, 3] and interior points [Ni, 3], m, and the voxel size, m.
 
-    Tracks with the same place in frame 0 count once, in lexicographic order of their places, those of the highest `rank` [Q] first
-    where one is given. Every voxel holds one point; object
-    before surface before interior. Its side is `settings.voxel`, or what `settings.nodes` needs. Points below the table are lifted
-    to it.
+    Each voxel keeps one point: object before surface before interior. Tracks with the same position in frame 0 count once. They
+    are in lexicographic order of their positions, or by decreasing `rank` [Q]. The voxel size is `settings.voxel`, or follows
+    from `settings.nodes`. Points below the table are lifted to it.
     """
     start = on_table(lifted.object_points[0], up)
     _, unique = np.unique(start, axis=0, return_index=True)
@@ -118,15 +117,15 @@ def structure(
 
 
 def spacing(nodes: np.ndarray) -> float:
-    """Distance from a node [N, 3] to the next, m (median)."""
+    """Median distance of the nodes [N, 3] to their nearest neighbors, m."""
     return float(np.median(cKDTree(nodes).query(nodes, k=2)[0][:, 1]))
 
 
 def among(points: np.ndarray, rank: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which tracked points [n, 3] become nodes, and which of the given nodes [N, 3] stay: indices, and [N] bool.
+    """Indices of the tracked points [n, 3] that become nodes, and [N] bool for the given nodes [N, 3] that stay.
 
-    Of points nearer to each other than nodes are, that of the highest `rank` [n] stays. A node gives way to a point within half of
-    that distance: together they are as dense as the nodes alone.
+    Chosen points are at least the node spacing apart; points of higher `rank` [n] are chosen first. A node closer to a chosen
+    point than half the spacing is removed, so that the density stays the same.
     """
     apart, chosen = spacing(nodes), np.zeros(0, int)
     for number in np.argsort(-rank, kind="stable"):
@@ -137,15 +136,16 @@ def among(points: np.ndarray, rank: np.ndarray, nodes: np.ndarray) -> tuple[np.n
 
 
 def cells_of(points: np.ndarray, voxel: float) -> np.ndarray:
-    """The voxel of each point, [n, 3] whole numbers from the lowest corner on."""
+    """Integer voxel indices [n, 3] of points, counted from the lowest corner."""
     cells: np.ndarray = np.floor((points - points.min(axis=0)) / voxel).astype(int)
     return cells
 
 
 def voxel_for(points: np.ndarray, most: int, least: float) -> float:
-    """The smallest of the sides `least` GROWTH^k, k = 0, 1, 2, ..., m, at which points [n, 3] lie in at most `most` voxels.
+    """Smallest voxel size `least` GROWTH^k, k = 0, 1, 2, ..., m, at which points [n, 3] occupy at most `most` voxels.
 
-    The number of voxels does not quite fall with their side. Trying one after the other, more voxels never make a larger side.
+    The number of voxels is not monotone in their size. Testing the sizes in order guarantees that a larger `most` never gives a
+    larger size.
     """
     for step in count():
         voxel = least * GROWTH**step
@@ -157,7 +157,7 @@ def voxel_for(points: np.ndarray, most: int, least: float) -> float:
 
 
 def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Points [count, 3] of a mesh, uniform by area."""
+    """Sample points [count, 3] on a mesh, uniform by area."""
     corners = vertices[faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     face = rng.choice(len(area), count, p=area / area.sum())
@@ -166,14 +166,14 @@ def on_surface(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.rand
 
 @wp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]
 def winding(mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, inside: wp.array[bool]):  # type: ignore[no-untyped-def]
-    """True where each point lies inside the closed mesh; `reach` bounds the search, m."""
+    """True for points inside the closed mesh; `reach` bounds the search, m."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach)
     inside[i] = query.result and query.sign < 0.0  # type: ignore[index,attr-defined]
 
 
 def inside(prior: ShapePrior, points: np.ndarray) -> np.ndarray:
-    """True where points [n, 3] lie inside the closed surface [n], by its winding number."""
+    """True for points [n, 3] inside the closed surface, by its winding number."""
     indices: wp.array = wp.array(prior.faces.ravel(), dtype=wp.int32, device="cpu")
     mesh = wp.Mesh(wp.array(prior.vertices, dtype=wp.vec3, device="cpu"), indices, support_winding_number=True)
     result = wp.zeros(len(points), dtype=wp.bool, device="cpu")

@@ -1,10 +1,10 @@
-"""Segmentation without a network: what differs from the table in height or color, refined by GrabCut; hands by their color.
+"""Segmentation without a network: foreground by height and color against the table, refined by GrabCut; hands by color.
 
-1. Color histograms (Lab) are made of the table, from the border of the images, and of what rises above it, in any frame. A cloth
-   that lies flat in frame 0 has its colors from later frames, in which it is lifted.
-2. Per frame, the log ratio of both and the height make seeds, and GrabCut draws the border.
-3. Foreground is divided into hands and object by the same kind of ratio. The hands' histogram starts from skin tones and is made
-   again from the hands that these show. Only pieces of some size are hands.
+1. Lab histograms are computed for the table, from the image borders, and for everything above it. A cloth that is flat
+   in frame 0 gets its colors from later frames.
+2. In each frame, height and the log ratio of both histograms give seeds, and GrabCut finds the border.
+3. The same kind of ratio divides the foreground into hands and object. The histogram of hands starts from skin tones, and is
+   computed again from the hands that these find. Small components are not hands.
 """
 
 from __future__ import annotations
@@ -21,49 +21,49 @@ from neuspring.perception.film import at_border, heights
 HISTOGRAM_BINS = (12, 64, 64)
 """Bins of L, a and b."""
 SAMPLED_FRAMES = 24
-"""Number of frames that the histograms are made from."""
+"""Number of frames for the histograms."""
 BORDER = 0.08
-"""Part of the image, at each side, that is taken for the table."""
+"""Width of the border that counts as table, as a fraction of the image on each side."""
 HISTOGRAM_BLUR = 1.0
-"""Width, in bins, by which histograms are blurred: a color seen once stands for its neighbors."""
+"""Width of the blur of histograms, bins: a color also supports its neighbors."""
 UNSEEN_COLOR = 1e-5
-"""Probability of a color never seen."""
+"""Probability of an unseen color."""
 TABLE_SHADES = (1.0, 0.85, 0.7, 0.55, 0.45)
-"""Factors that darken the table's colors, for shadows that fall beside the object and not on the border."""
+"""Factors that darken the table's colors, for shadows next to the object."""
 RISEN = 0.012
-"""Height above the table, m, from which a pixel is foreground whatever its color; below, its color decides."""
+"""m above the table: higher pixels are foreground; for lower pixels the color decides."""
 HAND_HUE, HAND_CHROMA = (35.0, 70.0), (9.0, 36.0)
-"""Skin in Lab: hue, degrees (atan2(b, a)), and chroma."""
+"""Ranges of skin in Lab: hue atan2(b, a), degrees, and chroma."""
 CERTAIN_HEIGHT = 2.5
-"""Pixels higher than this many times RISEN are foreground by their height alone."""
+"""Multiple of RISEN above which height alone fixes a pixel as foreground in GrabCut."""
 CERTAIN = 1.5
-"""Log ratio from which a color alone decides."""
+"""Log ratio above which color alone decides."""
 GRABCUT_MARGIN = 10
-"""Pixels around the seeds in which GrabCut may move the border."""
+"""Width of the region around the seeds in which GrabCut may move the border, pixels."""
 HAND_PIECE = 0.15
-"""A piece of hand color smaller than this part of the largest belongs to the object, which may have such colors too."""
+"""Hand-colored components smaller than this fraction of the largest belong to the object, which may have skin tones."""
 LARGEST_HOLE = 0.0015
-"""Holes in the foreground up to this part of the image are filled: print that has the table's color."""
+"""Holes in the foreground up to this fraction of the image are filled, such as prints in the table's color."""
 DECISION = 1.5
-"""Width, pixels, over which the decision between hand and object is averaged."""
+"""Width over which the decision between hand and object is averaged, pixels."""
 SMALLEST_PIECE = 0.0004
-"""Smallest area of a piece, as part of the image; smaller ones join what surrounds them."""
+"""Smallest area of a component, as a fraction of the image; smaller ones get the label around them."""
 SPECK = np.ones((3, 3), np.uint8)
 
 
 def lab_of(image: np.ndarray) -> np.ndarray:
-    """Lab [H, W, 3] uint8 of RGB."""
+    """Convert an RGB image to Lab [H, W, 3] uint8."""
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB)
 
 
 def bins_of(lab: np.ndarray, bins: tuple[int, int, int]) -> np.ndarray:
-    """The bin of every pixel [H, W], of so many bins of L, a and b."""
+    """Histogram bin of each Lab pixel [H, W], for numbers of bins of L, a and b."""
     first, second, third = (lab[..., axis].astype(np.int32) * count // 256 for axis, count in enumerate(bins))
     return np.asarray((first * bins[1] + second) * bins[2] + third)
 
 
 def segment(capture: Capture, camera: str) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError where nothing rises above the table."""
+    """Labels [T, H, W] uint8. Raises InputError if nothing is above the table."""
     rise, hand = learn(capture, camera)
     view = capture.cameras[camera]
     labels = np.zeros((capture.frame_count, view.height, view.width), dtype=np.uint8)
@@ -73,10 +73,9 @@ def segment(capture: Capture, camera: str) -> np.ndarray:
 
 
 def learn(capture: Capture, camera: str) -> tuple[np.ndarray, np.ndarray]:
-    """Log ratios of the probabilities of colors [bins], from frames of the whole video: of what rises to the table's, and of hands
-    to the object's.
+    """Log ratios of color probabilities [bins] over the video: foreground to table, and hands to object.
 
-    Raises InputError where nothing rises above the table. Without the color of hands all that rises is the object.
+    Without hand-colored pixels, all foreground is object. Raises InputError if nothing is above the table.
     """
     table, above = np.zeros(np.prod(HISTOGRAM_BINS)), np.zeros(np.prod(HISTOGRAM_BINS))
     views = []
@@ -96,14 +95,14 @@ def learn(capture: Capture, camera: str) -> tuple[np.ndarray, np.ndarray]:
     hands, body = _divide([(image, risen, _skin(image)) for image, risen in views])
     if not hands.sum():
         skin = f"hue in {list(HAND_HUE)} degrees, chroma in {list(HAND_CHROMA)} (Lab)"
-        print(f"{where}: nothing above the table has the color of hands ({skin}); all of it is the object", flush=True)
+        print(f"{where}: nothing above the table has the color of hands ({skin}); all foreground is object", flush=True)
     first = _log_probability(hands) - _log_probability(body)
     hands, body = _divide([(image, risen, first[_bins(image)] > 0) for image, risen in views])
     return _log_probability(above) - _log_probability(table), _log_probability(hands) - _log_probability(body)
 
 
 def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Histograms of hands and of the object in views of (image, what has risen, what has a hand's color)."""
+    """Histograms of hands and of object from images with their masks of foreground and of hand color."""
     hands, body = np.zeros(np.prod(HISTOGRAM_BINS)), np.zeros(np.prod(HISTOGRAM_BINS))
     for image, risen, like_hand in views:
         labels = _tidy(np.where(risen, np.where(like_hand, HANDS, OBJECT), 0).astype(np.uint8))
@@ -113,12 +112,12 @@ def _divide(views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.
 
 
 def _frame(capture: Capture, camera: str, frame: int, rise: np.ndarray, hand: np.ndarray) -> np.ndarray:
-    """Labels [H, W] of one frame, by the log ratios that `learn` gives."""
+    """Labels [H, W] of one frame, from the log ratios of `learn`."""
     image = capture.color(camera, frame)
     bins, height = _bins(image), heights(capture, camera, capture.depth(camera, frame))
     ratio = cv2.GaussianBlur(rise[bins], (0, 0), 1.0)
     flat = np.nan_to_num(height, nan=0.0) < RISEN
-    # High things are foreground whatever their color; low ones need the color of something that rises in some frame.
+    # High pixels are foreground; low pixels need a color that occurs above the table in some frame.
     seeds = (height > RISEN) | (flat & (ratio > CERTAIN))
     seeds = cv2.morphologyEx(seeds.astype(np.uint8), cv2.MORPH_OPEN, SPECK).astype(bool)
     foreground = _grab(image, seeds, ratio, height > CERTAIN_HEIGHT * RISEN) if seeds.any() else seeds
@@ -128,7 +127,7 @@ def _frame(capture: Capture, camera: str, frame: int, rise: np.ndarray, hand: np
 
 
 def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """GrabCut around the seeds: their core is foreground, it decides on rims and gaps that have the table's color."""
+    """GrabCut around the seeds: their core is foreground; GrabCut decides on rims, and on gaps in the table's color."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GRABCUT_MARGIN + 1,) * 2)
     near = cv2.dilate(seeds.astype(np.uint8), kernel).astype(bool)
     core = cv2.erode(seeds.astype(np.uint8), SPECK).astype(bool)
@@ -150,7 +149,7 @@ def _grab(image: np.ndarray, seeds: np.ndarray, ratio: np.ndarray, high: np.ndar
 
 
 def _holes(foreground: np.ndarray) -> np.ndarray:
-    """Small enclosed pieces of background [H, W] bool."""
+    """Small enclosed holes of background [H, W] bool."""
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats((~foreground).astype(np.uint8), connectivity=4)
     small = ~at_border(boxes, foreground.shape) & (boxes[:, cv2.CC_STAT_AREA] <= LARGEST_HOLE * foreground.size)
     small[0] = False
@@ -158,23 +157,23 @@ def _holes(foreground: np.ndarray) -> np.ndarray:
 
 
 def _tidy(labels: np.ndarray) -> np.ndarray:
-    """Specks, and pieces of hand color much smaller than the hand, become what surrounds them: nothing, or the other label."""
+    """Give small components, and hand components much smaller than the hand, the label around them."""
     tidy = labels.copy()
     for label, share in ((HANDS, HAND_PIECE), (OBJECT, 0.0)):
         _, pieces, boxes, _ = cv2.connectedComponentsWithStats((tidy == label).astype(np.uint8), connectivity=4)
         areas = boxes[1:, cv2.CC_STAT_AREA]
         least = max(SMALLEST_PIECE * labels.size, share * areas.max(initial=0))
         for piece in 1 + np.flatnonzero(areas < least):
-            own = pieces == piece
-            around = cv2.dilate(own.astype(np.uint8), SPECK).astype(bool) & ~own
+            small = pieces == piece
+            around = cv2.dilate(small.astype(np.uint8), SPECK).astype(bool) & ~small
             votes = np.bincount(tidy[around], minlength=3)
-            # A limb's tip borders on more table than limb, but it is not table.
-            tidy[own] = OBJECT if label == HANDS and votes[OBJECT] else votes.argmax()
+            # The tip of a limb borders mostly on the table, but belongs to the object.
+            tidy[small] = OBJECT if label == HANDS and votes[OBJECT] else votes.argmax()
     return tidy
 
 
 def _skin(image: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] whose hue and chroma are those of hands."""
+    """True for pixels [H, W] with the hue and chroma of skin."""
     a, b = lab_of(image)[..., 1:].astype(float).transpose(2, 0, 1) - 128.0
     hue, chroma = np.degrees(np.arctan2(b, a)), np.hypot(a, b)
     (least_hue, most_hue), (least_chroma, most_chroma) = HAND_HUE, HAND_CHROMA

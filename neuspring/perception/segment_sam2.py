@@ -1,10 +1,10 @@
-"""Segmentation by GroundingDINO and SAM 2, through `transformers` (extra `perception`): words find boxes in the first frame, boxes
-start masks, masks are carried through the video.
+"""Segmentation by GroundingDINO and SAM 2, through `transformers` (extra `perception`).
 
-Weights come from the usual Hugging Face cache or from a folder; they are large and only downloaded if `download` allows it. As in
-the released processing, the prompt names object and hand, boxes need a score, and every detection that is not a hand is the object.
+A text prompt finds boxes in the first frame, boxes start masks, and SAM 2 carries the masks through the video. As in PhysTwin's
+released processing, the prompt names object and hand, boxes need a minimum score, and each detection that is not a hand is the
+object. With a user's annotations (`carry`), SAM 2 starts from them and needs no prompt.
 
-With a user's marks (`carry`) SAM 2 starts from those, and words are not needed.
+Weights are read from the Hugging Face cache; they are downloaded only if `download` is true.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from neuspring.perception.film import CameraFilm, Carried, Progress, doubt_of, o
 from neuspring.perception.marks import Mark, drawn
 
 DETECTOR, VIDEO_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam2.1-hiera-large"
-"""GroundingDINO and SAM 2 on the Hugging Face hub, as released."""
+"""Models on the Hugging Face hub, as in the released processing."""
 BOX_SCORE, WORD_SCORE = 0.35, 0.25
-"""Least scores of a box, and of a word for it, as released."""
+"""Lowest scores of a box and of its words, as released."""
 UNSURE = 0.5
-"""Mean probability of the other side of a border that makes a doubt of 63 %."""
+"""Mean probability of the other label at borders that alone gives a doubt of 63 %."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Detection:
 
 
 def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, models: Models | None = None) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError where weights are missing or the prompt finds no object or no hand."""
+    """Labels [T, H, W] uint8. Raises InputError if weights are missing, or if the prompt finds no object or no hand."""
     models = models or load(settings, device)
     frames = frames_of(capture, camera)
     images = [capture.color(camera, frame) for frame in frames]
@@ -62,13 +62,13 @@ def segment(capture: Capture, camera: str, settings: GroundedSam2, device: str, 
     if all(is_hand) or not any(is_hand):
         missing = "hand" if detections and not any(is_hand) else "object"
         where = f"{capture.folder}, camera {camera}, frame {frames[0]}"
-        rule = f"the prompt {prompt!r} and 'hand' must find an object and a hand"
-        remedy = f"Write other words for the object as category of {CAPTURE}, or mark it: `neuspring annotate {capture.folder}`."
+        rule = f"the prompts {prompt!r} and 'hand' must find an object and a hand"
+        remedy = f"Set other words for the object as category of {CAPTURE}, or run `neuspring annotate {capture.folder}`."
         raise InputError(where, rule, f"no {missing} among {[detection.words for detection in detections]}", remedy)
     labels = np.zeros((capture.frame_count, *images[0].shape[:2]), dtype=np.uint8)
     boxes = {"obj_ids": list(range(len(detections))), "input_boxes": [[list(detection.box) for detection in detections]]}
     for index, logits in propagate(images, {0: boxes}, models, device).items():
-        # Hands come last: they are in front of what they hold.
+        # Hands come last because they occlude the object.
         labels[frames[index]][(logits[np.logical_not(is_hand)] > 0).any(axis=0)] = OBJECT
         labels[frames[index]][(logits[is_hand] > 0).any(axis=0)] = HANDS
     return labels
@@ -83,21 +83,21 @@ def carry(
     device: str,
     models: Models | None = None,
 ) -> Carried:
-    """Labels [T, H, W] and doubt [T] from marks on a few frames: SAM 2's prompts (`prompt_of`), carried both ways.
+    """Labels [T, H, W] and doubt [T] from annotations of a few frames, which become prompts (`prompt_of`) carried both ways.
 
-    Doubt comes from how unsure SAM 2 is at borders and from jumps of areas. Raises InputError where weights are missing or marks do
-    not fit.
+    Doubt combines SAM 2's uncertainty at borders and jumps of areas. Raises InputError if weights are missing, or if annotations
+    do not fit the capture.
     """
     if not any(mark.label == "object" for mark in marks):
         labels = sorted({mark.label for mark in marks})
-        raise InputError(f"marks of camera {camera}", "an object must be marked in one frame or more", labels)
+        raise InputError(f"annotations of camera {camera}", "an object must be annotated in at least one frame", labels)
 
     def work(film: CameraFilm, own: list[Mark]) -> Carried:
         networks = models or load(settings, device, words=False)
         images = [film.color(index) for index in range(film.count)]
         size = images[0].shape[:2]
         labels, unsure = np.zeros((film.count, *size), np.uint8), np.zeros((film.count, 2))
-        # Hands come last: they are in front of what they hold.
+        # Hands come last because they occlude the object.
         for column, label in enumerate((OBJECT, HANDS)):
             frames = sorted({mark.frame for mark in own if mark.value == label})
             prompts = {at: prompt_of([mark for mark in own if (mark.frame, mark.value) == (at, label)], size) for at in frames}
@@ -114,9 +114,10 @@ def carry(
 
 
 def prompt_of(marks: Sequence[Mark], size: tuple[int, int]) -> dict[str, Any]:
-    """SAM 2's prompt from the marks of one label on a frame of a size (height, width).
+    """Prompt for SAM 2 from the annotations of one label in a frame of a size (height, width).
 
-    Polygons are a mask; without any, the rectangle around all boxes is a box, and clicks and scribbles are points.
+    Polygons become a mask. Without polygons, the rectangle around all boxes becomes a box, and clicks and scribbles become
+    points.
     """
     if polygons := [drawn(mark, size, 1.0, grown=0) for mark in marks if mark.kind == "polygon"]:
         return {"obj_ids": [0], "input_masks": [np.any(polygons, axis=0)]}
@@ -131,9 +132,9 @@ def prompt_of(marks: Sequence[Mark], size: tuple[int, int]) -> dict[str, Any]:
 def propagate(
     images: list[np.ndarray], prompts: Mapping[int, Mapping[str, Any]], models: Models, device: str, *, back: bool = False
 ) -> dict[int, np.ndarray]:
-    """Logits [n, H, W] of n things by frame, carried from the first prompted frame on, and `back` from it.
+    """Logits [n, H, W] of n items by frame, carried forward from the first prompted frame, and backward with `back`.
 
-    `prompts` by frame are SAM 2's: `obj_ids` (0 to n - 1), and `input_boxes` or `input_masks`.
+    `prompts` by frame are those of SAM 2: `obj_ids` (0 to n - 1), and `input_boxes` or `input_masks`.
     """
     import torch
 
@@ -151,10 +152,10 @@ def propagate(
 
 
 def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
-    """Networks with pretrained weights, the detector only for `words`. Raises InputError saying which are missing."""
+    """Load the pretrained networks; the detector only with `words`. Raises InputError that names missing weights."""
     transformers = needed("transformers")
     local = not settings.download
-    # Safetensors alone: weights in a pickle are not read.
+    # Reads only safetensors, because a pickle can run code.
     weights = {"local_files_only": local, "use_safetensors": True}
     detector: Any = transformers.GroundingDinoForObjectDetection
     video_model: Any = transformers.Sam2VideoModel
@@ -168,12 +169,12 @@ def load(settings: GroundedSam2, device: str, *, words: bool = True) -> Models:
     except OSError as error:
         wanted = f"{DETECTOR} and {VIDEO_MODEL}" if words else VIDEO_MODEL
         rule = f"weights of {wanted} must be in the Hugging Face cache"
-        remedy = "Set perception.segment.grounded_sam2.download: true once, or copy the cache from a machine that has it."
+        remedy = "Set perception.segment.grounded_sam2.download: true once, or copy the cache from another machine."
         raise InputError("perception.segment.grounded_sam2", rule, str(error).splitlines()[0], remedy) from error
 
 
 def detect(image: np.ndarray, prompt: str, models: Models, device: str) -> list[Detection]:
-    """Boxes of an RGB image that the prompt finds, best first."""
+    """Boxes that the prompt finds in an RGB image, best first."""
     import torch
 
     words = f"{prompt}. hand."

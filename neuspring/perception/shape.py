@@ -1,20 +1,21 @@
-"""The shape prior, which completes what the cameras do not see in frame 0: a closed surface by carving voxels, a mesh, or none.
+"""Shape prior: the surface that no camera sees in frame 0, as a visual hull, a given mesh, or none.
 
-A voxel belongs to the hull if no camera that has the object in view contradicts it, and at least one shows the object there. A
-camera contradicts a voxel if its mask shows neither the object nor a hand before it, or if it measured depth behind the voxel.
-Without the second condition a hand that all cameras see would belong to the hull. Nothing under the table belongs to it.
+**Visual hull.** A voxel above the table belongs to the hull if no camera with the object in view contradicts it, and at least one
+camera shows the object there. A camera contradicts a voxel if its mask shows neither the object nor an occluding hand, or if it
+measured depth behind the voxel. The second condition excludes hands that all cameras see.
 
-Where one camera alone shows the object there is no other witness: pixels of its mask without depth carve with the depth nearest to
-them, and the hull ends at a back that is guessed, in depths along the optical axis, m. The local width of a silhouette at a pixel
-is the diameter 2 r of the largest disc inside it that covers the pixel; at a distance d from the edge a round body of that width is
-c(d) = 2 sqrt(r^2 - (r - d)^2) thick.
+**One camera.** If only one camera shows the object, mask pixels without depth carve with the nearest depth in the mask, and the
+back is guessed. All depths are along the optical axis, m. The local width of a silhouette at a pixel is the diameter 2 r of the
+largest inscribed disc that covers the pixel. At a distance d from the edge, a round body of that width has the thickness
 
-Its back is 2 middle - seen, where `middle` is the surface that the silhouette's rim spans (a harmonic one, held at seen + c / 2 on
-the rim). One plane perpendicular to the view is no substitute: bodies lie oblique to it.
+    c(d) = 2 sqrt(r^2 - (r - d)^2)
 
-A mesh of the object from any generator, in any pose and size, is put where the object lies in frame 0: poses over all directions
-are tried; the best few are refined by ICP with scale against the observed cloud, which is only a part of the surface; then the mesh
-is bent, as smoothly as possible, so that its visible part lies where the cameras saw it.
+The back is 2 middle - seen. `middle` is a harmonic surface over the silhouette with the values seen + c / 2 on the rim. A plane
+perpendicular to the view is worse, because objects are oblique to it.
+
+**Mesh.** A mesh of the object in any pose and size is aligned with frame 0. Initial poses cover all rotations; the best few are
+refined by ICP with scale against the observed cloud, which is only part of the surface. Then a smooth deformation moves the
+visible part of the mesh onto the cloud.
 """
 
 from __future__ import annotations
@@ -44,50 +45,51 @@ from neuspring.perception.backends import TRACKERS
 from neuspring.perception.sample import on_surface
 
 CARVED_MARGIN = 0.02
-"""m around the cloud of frame 0 within which voxels are carved."""
+"""m: margin of the carved volume around the cloud of frame 0."""
 CARVING_TOLERANCE = 0.004
-"""m by which measured depth may lie behind a voxel before the voxel is carved."""
+"""m: a voxel is carved if measured depth is more than this behind it."""
 HULL_VOXEL = 0.003
-"""Side of a voxel of the visual hull, m: a few depth pixels at a camera's distance."""
+"""Voxel size of the visual hull, m: a few depth pixels at a typical distance."""
 HULL_SMOOTHING = 1.0
-"""Width, voxels, by which the hull is smoothed."""
+"""Width of the smoothing of the hull, voxels."""
 SEEN_WITHIN = 4.0
-"""Voxels between a vertex of the shape and the depth of a camera that saw it: carving and smoothing move a surface by less."""
+"""Voxels: a vertex within this distance of measured depth counts as seen. Carving and smoothing move a surface by less."""
 MASK_BORDER = 3
-"""Pixels that a rim is wide; depth is doubtful at its first."""
+"""Width of a silhouette's rim, pixels; depth is unreliable at its outermost pixel."""
 LEAST_THICKNESS = 0.006
-"""m: a body is at least this thick."""
+"""m: smallest thickness of the object."""
 POSES = 24 * 8
 REFINED = 24
-"""Best poses that are refined to the end: with 6, one in 16 turns of a flat body ends in a wrong pose."""
+"""Number of best poses that are refined. With 6, one in 16 rotations of a flat object ends in a wrong pose."""
 ITERATIONS = 40
 COMPARED_SURFACE = 1500
-"""Points of cloud and mesh that are compared."""
+"""Largest number of points of cloud and of mesh in ICP."""
 INLIERS = 0.85
-"""Share of the nearest pairs that a step uses; the rest count as outliers."""
+"""Fraction of the nearest pairs that an ICP step uses; the rest are outliers."""
 BEND_REACH = 0.02
-"""Largest distance, m, of a visible vertex from the cloud that it is moved onto."""
+"""m: visible vertices farther than this from the cloud are not moved onto it."""
 MISFIT, LEAST_MISFIT = 0.03, 0.008
-"""RMS distance of the cloud from a placed mesh that is fine, as a part of the cloud's length, and at least, m. The surface of
-the demo's sloth has 0.018, in a wrong pose 0.034; a box, the sloth on a floor and the sloth beside a ball have 0.048 to 0.065."""
+"""Largest accepted RMS distance of the cloud from an aligned mesh, as a fraction of the cloud's length, and at least this, m.
+The true surface of the demo's sloth has 0.018, in a wrong pose 0.034; a box, the sloth with a floor or with a ball 0.048 to
+0.065."""
 LARGEST_RATIO, LOWEST_VERTEX = 1.35, -0.03
-"""Length of a mesh over that of the cloud, and height of its lowest vertex, m, that are fine."""
+"""Largest accepted ratio of the lengths of mesh and cloud, and lowest accepted vertex, m above the table."""
 SEAM = 2e-5
-"""Corners nearer than this part of a mesh's length are one."""
+"""Vertices closer than this fraction of a mesh's length are merged."""
 STIFFNESS = 5.0
 """Weight of smoothness against data in the last, non-rigid step."""
 
 Fit = tuple[float, Rotation, float, np.ndarray]
-"""RMS distance, m, and the similarity: rotation, scale, shift."""
+"""RMS distance, m, and the similarity: rotation, scale, translation."""
 
 
 def shape_prior(
     capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None = None
 ) -> ShapePrior:
-    """The prior of the backend that `settings` names, with the share of its surface that no camera saw.
+    """Compute the prior by the backend of `settings`, with the fraction of its surface that no camera saw.
 
-    `cloud` [P, 3], m, is what was seen of the object in frame 0. With one camera, `end` [H, W] is the depth at which the object
-    ends, m, where that is supposed otherwise than by `settings.back`.
+    `cloud` [P, 3], m: visible points of the object in frame 0. `end` [H, W], m: depth of the back for one camera, in place of
+    `settings.back`.
     """
     backend = settings.backend
     if backend == "auto":
@@ -101,7 +103,7 @@ def shape_prior(
     if not len(prior.faces):
         return prior
     was_seen = seen(prior.vertices, capture, masks, SEEN_WITHIN * HULL_VOXEL, prior.faces)
-    # A face counts by the share of its corners.
+    # The invented area of a face is the fraction of its unseen corners.
     corners = prior.vertices[prior.faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     share = float((area * (~was_seen[prior.faces]).mean(axis=1)).sum() / area.sum())
@@ -109,20 +111,20 @@ def shape_prior(
 
 
 def no_prior() -> ShapePrior:
-    """The empty prior: the twin has only what was seen."""
+    """The empty prior: the twin has only observed points."""
     return ShapePrior(vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=int), backend="none")
 
 
 def visual_hull(
     capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings, end: np.ndarray | None = None
 ) -> ShapePrior:
-    """Carve the surroundings of the object's `cloud` [P, 3], m, of frame 0; `end` as in `shape_prior`.
+    """Carve the visual hull around the object's `cloud` [P, 3], m, in frame 0; `end` as in `shape_prior`.
 
-    Raises InputError if nothing remains.
+    Raises InputError if no voxel remains.
     """
-    # A camera that does not have the object in view says nothing about it.
+    # A camera without the object in view gives no evidence.
     showing = [name for name in capture.cameras if (masks[name].labels[0] == OBJECT).any()]
-    # Measured depth by camera, and where the object ends, if that is guessed.
+    # Measured depth by camera, and the depth of a guessed back.
     sides: dict[str, tuple[np.ndarray, np.ndarray | None]] = {name: (capture.depth(name, 0), None) for name in showing}
     space, facts = cloud, dict[str, float]()
     if len(showing) == 1:
@@ -146,8 +148,8 @@ def visual_hull(
     hull = _largest_piece(hull & shown)
     vertices, faces = _surface(hull, low, HULL_VOXEL, HULL_SMOOTHING)
     if not len(faces):
-        rule = f"more than specks of {1e3 * HULL_VOXEL:g} mm must be consistent with all cameras"
-        remedy = "Masks, depth and calibration of frame 0 contradict each other; or take perception.shape.backend: none."
+        rule = f"some voxels of {1e3 * HULL_VOXEL:g} mm must be consistent with all cameras"
+        remedy = "Check masks, depth and calibration of frame 0, which disagree, or set perception.shape.backend: none."
         raise InputError(f"{capture.folder}, visual hull", rule, f"{hull.sum()} voxels", remedy)
     facts |= {"volume": float(hull.sum() * HULL_VOXEL**3), "cameras": len(showing)}
     backend = "visual_hull" if len(showing) > 1 else f"visual_hull, back: {settings.back}"
@@ -157,9 +159,9 @@ def visual_hull(
 def one_sided(
     camera: Camera, labels: np.ndarray, depth: np.ndarray, cloud: np.ndarray, settings: ShapePriorSettings
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Depth of the seen surface [H, W], m, without holes, and of the back; None where that is not guessed."""
+    """Depth of the visible surface without holes and of the back, [H, W], m; None if the back is not guessed."""
     distance = camera.project(cloud)[1]
-    # What lies far before or behind all usable points shines through, or is noise.
+    # Depth far in front of or behind all usable points is background or noise.
     near, far = float(distance.min()) - CARVED_MARGIN, float(distance.max()) + CARVED_MARGIN
     filled = np.where(labels == OBJECT, front(labels == OBJECT, depth, near, far), depth)
     if settings.back == "none":
@@ -170,9 +172,9 @@ def one_sided(
 def _consistent(
     grid: np.ndarray, camera: Camera, labels: np.ndarray, depth: np.ndarray, end: np.ndarray | None, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels [nx, ny, nz] bool that one camera admits, and those where it shows the object there, not a hand or a person before it.
+    """Voxels [nx, ny, nz] bool that do not contradict one camera, and voxels where it shows the object itself.
 
-    It admits nothing behind the object's `end` [H, W], m, if there is a guess of that.
+    Voxels behind the object's `end` [H, W], m, contradict the camera.
     """
     pixels, distance = camera.project(grid.reshape(-1, 3))
     admitted, shows = np.ones(len(distance), dtype=bool), np.zeros(len(distance), dtype=bool)
@@ -193,7 +195,7 @@ def _largest_piece(voxels: np.ndarray) -> np.ndarray:
 
 
 def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes of the occupancy, blurred over `smoothing` voxels, padded so that the surface closes."""
+    """Closed surface by marching cubes of the padded occupancy, blurred over `smoothing` voxels."""
     level = 0.5 - ndimage.gaussian_filter(np.pad(voxels.astype(np.float32), 2), smoothing)
     values: wp.array = wp.array(level, dtype=wp.float32, device="cpu")
     vertices, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
@@ -205,8 +207,10 @@ def _surface(voxels: np.ndarray, low: np.ndarray, voxel: float, smoothing: float
 
 
 def front(mask: np.ndarray, depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth [H, W] of the seen surface: pixels of `mask` [H, W] without a depth between `near` and `far` get that of the nearest
-    pixel of the mask that has one. Zero outside the mask, and everywhere if no pixel has one."""
+    """Depth of the visible surface [H, W]; zero outside `mask` [H, W], and everywhere without usable depth.
+
+    A mask pixel whose depth is not between `near` and `far` gets the depth of the nearest usable mask pixel.
+    """
     usable = mask & (depth > near) & (depth < far)
     if not usable.any():
         return np.zeros(depth.shape)
@@ -215,11 +219,10 @@ def front(mask: np.ndarray, depth: np.ndarray, near: float, far: float) -> np.nd
 
 
 def back(labels: np.ndarray, seen: np.ndarray, focal: float) -> np.ndarray:
-    """Depth [H, W] of the back, from labels [H, W], the `seen` surface [H, W] and the focal length in pixels; zero outside the
-    object."""
+    """Depth of the back [H, W] from labels [H, W], the `seen` surface [H, W] and the focal length, pixels; zero outside."""
     mask = labels == OBJECT
     chord = round_chord(mask) * seen / focal
-    # Beyond the edge as at the edge, so that the median of a rim's pixel is one of the object.
+    # Continues the object outside the mask, so that the median filter at the rim reads only its depth.
     extended = front(np.ones_like(mask), np.where(mask, seen, 0.0), 0.0, np.inf)
     smooth = cv2.medianBlur(extended.astype(np.float32), 5).astype(float)
     rim = mask & _grown(labels == NOTHING, MASK_BORDER) & ~_grown(labels >= HANDS, MASK_BORDER + 1)
@@ -230,7 +233,7 @@ def back(labels: np.ndarray, seen: np.ndarray, focal: float) -> np.ndarray:
 
 
 def round_chord(mask: np.ndarray) -> np.ndarray:
-    """c(d) [H, W], pixels, of a silhouette `mask` [H, W]; zero outside it."""
+    """Thickness c(d) of a round object [H, W], pixels, from its silhouette `mask` [H, W]; zero outside it."""
     centers, radii, distance = discs(mask)
     radius = np.ascontiguousarray(distance)
     # Larger discs are drawn over smaller ones.
@@ -241,9 +244,10 @@ def round_chord(mask: np.ndarray) -> np.ndarray:
 
 
 def discs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The largest discs inside a silhouette `mask` [H, W], and the distance of each pixel from its edge [H, W], pixels.
+    """Largest discs inside a silhouette `mask` [H, W]: centers (x, y) [n, 2], radii [n], and the distance transform [H, W],
+    pixels.
 
-    Their centers (x, y) [n, 2] lie on the ridges of that distance, which is their radius [n]; the largest is the last.
+    Centers are on the ridges of the distance from the edge, which is the radius. Radii increase.
     """
     distance = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     y, x = np.nonzero(mask & (distance >= ndimage.maximum_filter(distance, 3) - 0.5))
@@ -256,7 +260,7 @@ def _grown(mask: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The harmonic surface [H, W] over `mask` that has `values` on its `rim`: each other pixel is the mean of its neighbors."""
+    """Harmonic surface [H, W] over `mask` with `values` on its `rim`: each other pixel is the mean of its neighbors."""
     index = np.full(mask.shape, -1)
     index[mask] = np.arange(mask.sum())
     down, right = ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))
@@ -264,7 +268,7 @@ def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarra
     graph = coo_matrix((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(int(mask.sum()),) * 2)
     graph = graph + graph.T
     held = rim[mask].astype(float)
-    # A piece of the mask without a rim would be free; it is held, weakly, where it is.
+    # The weak weight keeps a component without a rim at its values.
     held = np.where(held > 0, 1.0, 1e-6)
     laplacian = diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
     result = np.zeros(mask.shape)
@@ -275,9 +279,10 @@ def _spanned(values: np.ndarray, rim: np.ndarray, mask: np.ndarray) -> np.ndarra
 def seen(
     vertices: np.ndarray, capture: Capture, masks: Mapping[str, Masks], reach: float, faces: np.ndarray | None = None
 ) -> np.ndarray:
-    """True where some camera shows the object within `reach`, m, of each vertex [V] along its optical axis.
+    """True for vertices [V] at which some camera measures the object within `reach`, m, along its optical axis.
 
-    With `faces` [F, 3], outward, a vertex must face that camera too: the back of a rope lies within any reach of its front.
+    With outward `faces` [F, 3], a vertex must also face that camera, because the back of a thin rope is within reach of its
+    front.
     """
     result = np.zeros(len(vertices), dtype=bool)
     normals = None if faces is None else trimesh.Trimesh(vertices, faces, process=False).vertex_normals
@@ -293,9 +298,9 @@ def seen(
 
 
 def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings) -> ShapePrior:
-    """The mesh `settings.mesh`, placed on the cloud [P, 3], m, of frame 0. Raises InputError for unreadable or open meshes."""
+    """Align the mesh `settings.mesh` with the cloud [P, 3], m, of frame 0. Raises InputError if it is unreadable or misfits."""
     if settings.mesh is None:
-        raise InputError("perception.shape.mesh", "backend: mesh needs a file", "null", "Name a GLB, PLY or OBJ file.")
+        raise InputError("perception.shape.mesh", "backend: mesh requires a file", "null", "Name a GLB, PLY or OBJ file.")
     vertices, faces = read_mesh(Path(settings.mesh))
     vertices, rms = place(vertices, faces, cloud)
     require_fit(Path(settings.mesh), vertices, rms, cloud, capture.description.up_sign)
@@ -304,20 +309,20 @@ def align(capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray, setti
 
 
 def require_fit(path: Path, vertices: np.ndarray, rms: float, cloud: np.ndarray, up: float) -> None:
-    """Raise InputError where a mesh, placed on the cloud [P, 3], m, at this RMS distance, is not the object's."""
+    """Raise InputError if an aligned mesh with this RMS distance does not match the cloud [P, 3], m."""
     size = float(np.ptp(cloud, axis=0).max())
     ratio, lowest = float(np.ptp(vertices, axis=0).max()) / size, float((up * vertices[:, 2]).min())
     if rms > max(LEAST_MISFIT, MISFIT * size) or ratio > LARGEST_RATIO or lowest < LOWEST_VERTEX:
-        rule = f"the mesh must fit what was seen: RMS distance at most {1e3 * max(LEAST_MISFIT, MISFIT * size):.0f} mm, "
+        rule = f"the mesh must fit the observed points: RMS distance at most {1e3 * max(LEAST_MISFIT, MISFIT * size):.0f} mm, "
         rule += f"at most {LARGEST_RATIO:g} times as long, at most {-1e3 * LOWEST_VERTEX:.0f} mm below the table"
         received = f"{1e3 * rms:.0f} mm, {ratio:.2f} times, {max(0.0, -1e3 * lowest):.0f} mm"
         raise InputError(
-            path, rule, received, "Remove other bodies and floors from the file, or use perception.shape.backend: auto."
+            path, rule, received, "Remove other objects and floors from the file, or set perception.shape.backend: auto."
         )
 
 
 def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
-    """Vertices [V, 3], m, after the similarity that brings the mesh to the cloud, and the RMS distance of the cloud to it, m."""
+    """Align a mesh with the cloud by a similarity; returns vertices [V, 3], m, and the RMS distance of the cloud from it, m."""
     rng = np.random.default_rng(0)
     target = cloud[rng.permutation(len(cloud))[:COMPARED_SURFACE]].astype(float)
     source = on_surface(vertices, faces, COMPARED_SURFACE, rng)
@@ -325,7 +330,7 @@ def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[n
     spread = (source - center).std()
     unit = (source - center) / spread
     middle = target.mean(axis=0)
-    # The cloud is a part of the surface, so its spread is a little less than the body's.
+    # The cloud is part of the surface, so its spread is slightly smaller than that of the object.
     scale = 1.05 * (target - middle).std()
     coarse = [_icp(unit, target, turn, scale, middle, ITERATIONS // 8) for turn in Rotation.random(POSES, rng=rng)]
     coarse.sort(key=lambda fit: fit[0])
@@ -335,7 +340,7 @@ def place(vertices: np.ndarray, faces: np.ndarray, cloud: np.ndarray) -> tuple[n
 
 
 def _icp(source: np.ndarray, target: np.ndarray, rotation: Rotation, scale: float, shift: np.ndarray, iterations: int) -> Fit:
-    """Trimmed ICP over similarities: every target point looks for its nearest source point."""
+    """Trimmed ICP over similarities, from each target point to its nearest source point."""
     rms = np.inf
     for _ in range(iterations):
         distance, nearest = cKDTree(scale * rotation.apply(source) + shift).query(target)
@@ -343,19 +348,19 @@ def _icp(source: np.ndarray, target: np.ndarray, rotation: Rotation, scale: floa
         pairs, goals = source[nearest[inlier]], target[inlier]
         center, goal = pairs.mean(axis=0), goals.mean(axis=0)
         rotation, _ = Rotation.align_vectors(goals - goal, pairs - center)
-        turned = rotation.apply(pairs - center)
-        scale = float(((goals - goal) * turned).sum() / max((turned**2).sum(), 1e-12))
+        rotated = rotation.apply(pairs - center)
+        scale = float(((goals - goal) * rotated).sum() / max((rotated**2).sum(), 1e-12))
         shift = goal - scale * rotation.apply(center)
         rms = float(np.sqrt((distance**2).mean()))
     return rms, rotation, scale, shift
 
 
 def bend(vertices: np.ndarray, faces: np.ndarray, capture: Capture, masks: Mapping[str, Masks], cloud: np.ndarray) -> np.ndarray:
-    """Vertices moved by displacements d [V, 3], m, with the least |S (d - t)|^2 + k |L d|^2.
+    """Move vertices by displacements d [V, 3], m, that minimize |S (d - t)|^2 + k |L d|^2.
 
-    S selects the visible vertices: those whose pixel shows the object at about their depth in some camera. t points to the nearest
-    point of the cloud, within BEND_REACH. L is the uniform graph Laplacian, k the stiffness. (`nricp_amberg` of trimesh
-    is no substitute: it pulls hidden vertices as well and fails where no point of the cloud is near enough.)
+    S selects the visible vertices (`seen`) within BEND_REACH of the cloud, t points to the nearest point of the cloud, L is the
+    uniform graph Laplacian, and k is STIFFNESS. `nricp_amberg` of trimesh does not replace it: it also pulls hidden vertices, and
+    fails if no point of the cloud is near.
     """
     visible = seen(vertices, capture, masks, BEND_REACH)
     distance, nearest = cKDTree(cloud).query(vertices)
@@ -369,42 +374,42 @@ def bend(vertices: np.ndarray, faces: np.ndarray, capture: Capture, masks: Mappi
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and outward faces [F, 3] of the file's whole geometry as one closed surface.
+    """Read all geometry of a file as one closed surface: vertices [V, 3] and outward faces [F, 3].
 
-    Raises InputError for a file that is missing, unreadable, empty, not finite or not closed.
+    Raises InputError if the file is missing, unreadable or empty, or if the mesh is not finite or not closed.
     """
     if not Path(path).is_file():
-        raise InputError(path, "this mesh must exist", "no such file")
+        raise InputError(path, "the mesh file must exist", "no such file")
     if b"KHR_draco_mesh_compression" in path.read_bytes():
         remedy = f"Unpack it: npx @gltf-transform/cli copy {path.name} unpacked.glb"
-        raise InputError(path, "a mesh without compression is required", "KHR_draco_mesh_compression", remedy)
+        raise InputError(path, "the mesh must not be compressed", "KHR_draco_mesh_compression", remedy)
     try:
         mesh = trimesh.load_mesh(path, process=True, maintain_order=False)
     except Exception as error:
-        # trimesh's readers have no common exception for damaged bytes.
-        told = f"{type(error).__name__}: {error}"
-        raise InputError(path, "this file must be a readable mesh (GLB, PLY, OBJ, STL)", told) from error
+        # trimesh raises no common exception for damaged files.
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(path, "the file must be a readable mesh (GLB, PLY, OBJ, STL)", reason) from error
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(path, "at least one triangle is required", "none")
+        raise InputError(path, "the mesh must have at least one triangle", "none")
     # Textured exports split vertices along seams.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(path, "every vertex must be finite", "a vertex that is not")
+        raise InputError(path, "all vertices must be finite", "NaN or infinity")
     if not mesh.is_watertight:
         mesh = _without_seams(mesh)
     if len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) < len(mesh.faces):
-        raise InputError(path, "each triangle must be there once", "some twice (double sided)", "Export one side.")
+        raise InputError(path, "each triangle must occur once", "double-sided triangles", "Export one side.")
     if not mesh.is_watertight:
-        remedy = "Close it in a mesh editor; points are drawn inside it."
+        remedy = "Close it in a mesh editor; nodes are sampled inside it."
         raise InputError(path, "the surface must be closed", f"{len(mesh.faces)} triangles with open or branching edges", remedy)
     trimesh.repair.fix_normals(mesh)
     return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
 
 
 def _without_seams(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with corners that lie within SEAM of each other made one."""
+    """The mesh with vertices within SEAM of each other merged."""
     pairs = cKDTree(mesh.vertices).query_pairs(SEAM * float(mesh.extents.max()), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(mesh.vertices),) * 2)
     _, first, group = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)

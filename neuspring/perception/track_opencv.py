@@ -1,8 +1,8 @@
 """Dense tracking without a network: pyramidal Lucas-Kanade with a forward-backward check.
 
 Points start in frame 0 on random pixels inside the masks. A point is lost if it fails the check, leaves the image or its mask, or
-moves otherwise than its neighbors. Lost points are looked for again in every frame: where their neighbors of frame 0 went, by
-Lucas-Kanade from frame 0, accepted if the patch looks alike.
+disagrees with the motion of its neighbors. In each later frame, Lucas-Kanade from frame 0 searches lost points where their
+neighbors moved, and accepts a match if the patches correlate.
 """
 
 from __future__ import annotations
@@ -20,65 +20,65 @@ from neuspring.data.frames import gray
 from neuspring.perception.film import PERCEPTION_SEED
 
 MOST_TRACKED = 5000
-"""Pixels that are followed per camera, drawn at random from the masks of frame 0."""
+"""Largest number of tracked pixels per camera, random in the masks of frame 0."""
 LEVELS = 3
-"""Levels of the image pyramid, beside the image itself."""
+"""Levels of the image pyramid above the image itself."""
 TRACK_BACKWARD = 0.5
-"""Largest distance, pixels, by which a point may miss its start when it is followed there and back."""
+"""Largest forward-backward error, pixels."""
 FLOW_SIDE = 9
-"""Side of the Lucas-Kanade window, pixels. A large window averages over deformation and background."""
+"""Side of the Lucas-Kanade window, pixels; a large window averages over deformation and background."""
 PATCH = 9
 """Side of compared patches, pixels."""
 LIKENESS = 0.85
-"""Least correlation of a patch that is found again with the point's patch of frame 0."""
+"""Smallest correlation of a recovered patch with the patch of frame 0."""
 LOST_GUIDES = 6
-"""Nearest living points of frame 0, whose motion says where a lost point may be."""
+"""Number of nearest tracked points in frame 0 whose motion predicts a lost point."""
 VOTERS = 8
-"""Neighbors that vote on a point's motion."""
+"""Number of neighbors that vote on the motion of a point."""
 CONSENSUS = 4.0
-"""Pixels by which a point's motion since frame 0 may differ from the median of its neighbors'."""
+"""Largest difference of a point's motion since frame 0 from the median of its neighbors, pixels."""
 EQUALIZED_WIDTH = 2.0
-"""Width, pixels, over which brightness and contrast are made equal for Lucas-Kanade, so that shading does not pull."""
+"""Width over which brightness and contrast are normalized, pixels, so that shading does not bias Lucas-Kanade."""
 FAINT = 4.0
-"""Gray levels of deviation below which contrast is not raised further: noise."""
+"""Local deviation below which contrast is not amplified further, gray levels; weaker contrast is noise."""
 CONTRAST = 40.0
-"""Gray levels that one local deviation becomes."""
+"""Gray levels of one local standard deviation after normalization."""
 STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 REMAP_LIMIT = 30000
-"""Points per call of cv2.remap, which takes images of less than 32768 points a side."""
+"""Largest number of points per call of cv2.remap, which accepts fewer than 32768 per side."""
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Places of points of frame 0 in every frame."""
+    """Positions of the points of frame 0 in all frames."""
 
     pixels: np.ndarray
-    """[T, Q, 2]."""
+    """[T, Q, 2] (x, y)."""
     visible: np.ndarray
     """[T, Q] bool."""
 
     @classmethod
     def starting_at(cls, start: np.ndarray, frames: int) -> Followed:
-        """Points [Q, 2] that stay where they are and are visible in frame 0 alone."""
+        """Points [Q, 2] that do not move and are visible only in frame 0."""
         visible = np.zeros((frames, len(start)), dtype=bool)
         visible[0] = True
         return cls(np.repeat(start[None], frames, axis=0), visible)
 
 
 def track(capture: Capture, camera: str, labels: np.ndarray, settings: PointTracking) -> Followed:
-    """Follow up to MOST_TRACKED pixels of the masks `labels` [T, H, W]; none where frame 0 shows neither object nor hands."""
+    """Track up to MOST_TRACKED pixels of the masks `labels` [T, H, W]; none if frame 0 shows neither object nor hands."""
     return follow(capture, camera, labels, choose(labels[0]), settings)
 
 
 def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray, settings: PointTracking) -> Followed:
-    """Follow points (x, y) [Q, 2] float32 of frame 0; they belong to its nearest label, and vote on each other's motion.
+    """Track points (x, y) [Q, 2] float32 of frame 0 through the masks `labels` [T, H, W].
 
-    `labels` [T, H, W] are masks; frame 0 must show object or hands.
+    Each point belongs to the nearest label in frame 0, which must show object or hands. Points of one label vote on their motion.
     """
     own = _labels_at(labels[0], start)
-    if (beside := own == NOTHING).any():
+    if (outside := own == NOTHING).any():
         y, x = np.nonzero(np.isin(labels[0], (OBJECT, HANDS)))
-        own[beside] = labels[0][y, x][cKDTree(np.stack([x, y], axis=1)).query(start[beside])[1]]
+        own[outside] = labels[0][y, x][cKDTree(np.stack([x, y], axis=1)).query(start[outside])[1]]
     result = Followed.starting_at(start, capture.frame_count)
     pixels, visible = result.pixels, result.visible
     first = before = equalized(gray(capture, camera, 0))
@@ -88,15 +88,15 @@ def follow(capture: Capture, camera: str, labels: np.ndarray, start: np.ndarray,
         if not capture.has(camera, frame):
             continue
         now = equalized(gray(capture, camera, frame))
-        place, alive = pixels[last].copy(), visible[last].copy()
+        position, alive = pixels[last].copy(), visible[last].copy()
         if alive.any():
-            place[alive], alive[alive] = lucas_kanade(before, now, place[alive], place[alive], FLOW_SIDE)
-        alive &= inside(place, now.shape)
-        alive |= _reacquire(first, now, start, place, alive)
-        alive &= _held(labels[frame], place, own, settings.rim)
+            position[alive], alive[alive] = lucas_kanade(before, now, position[alive], position[alive], FLOW_SIDE)
+        alive &= inside(position, now.shape)
+        alive |= _reacquire(first, now, start, position, alive)
+        alive &= _held(labels[frame], position, own, settings.rim)
         for label in np.unique(own):
-            _outvote(start, place, alive, own == label)
-        pixels[frame], visible[frame] = np.where(alive[:, None], place, pixels[last]), alive
+            _outvote(start, position, alive, own == label)
+        pixels[frame], visible[frame] = np.where(alive[:, None], position, pixels[last]), alive
         before, last = now, frame
     return result
 
@@ -114,7 +114,7 @@ def choose(labels: np.ndarray, count: int | None = None) -> np.ndarray:
 def lucas_kanade(
     source: np.ndarray, target: np.ndarray, points: np.ndarray, guess: np.ndarray, window: int, levels: int = LEVELS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places in the target [n, 2] near the `guess`, and whether going back returns to the start [n]."""
+    """Positions in the target [n, 2] near the `guess`, and whether the forward-backward check succeeds [n]."""
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     options: dict[str, Any] = {"winSize": (window, window), "maxLevel": levels, "criteria": STOP, "flags": flags}
     points = np.ascontiguousarray(points, dtype=np.float32)
@@ -125,45 +125,45 @@ def lucas_kanade(
     return np.asarray(moved), there.ravel().astype(bool) & back.ravel().astype(bool) & near
 
 
-def _reacquire(first: np.ndarray, now: np.ndarray, start: np.ndarray, place: np.ndarray, alive: np.ndarray) -> np.ndarray:
-    """Which lost points are seen again [Q] bool; their places are written into `place`."""
+def _reacquire(first: np.ndarray, now: np.ndarray, start: np.ndarray, position: np.ndarray, alive: np.ndarray) -> np.ndarray:
+    """True for lost points that are found again [Q]; writes their positions into `position`."""
     lost, guides = np.flatnonzero(~alive), np.flatnonzero(alive)
     again = np.zeros(len(start), dtype=bool)
     if not len(lost):
         return again
-    guess = place[lost]
+    guess = position[lost]
     if len(guides) >= LOST_GUIDES:
         nearest = guides[cKDTree(start[guides]).query(start[lost], k=LOST_GUIDES)[1]]
-        guess = start[lost] + np.median((place - start)[nearest], axis=1)
+        guess = start[lost] + np.median((position - start)[nearest], axis=1)
     moved, ok = lucas_kanade(first, now, start[lost], guess, FLOW_SIDE)
     ok &= np.linalg.norm(moved - guess, axis=1) < FLOW_SIDE
     ok &= inside(moved, now.shape)
     if ok.any():
         ok[ok] = likeness(first, now, start[lost][ok], moved[ok]) > LIKENESS
-        place[lost[ok]] = moved[ok]
+        position[lost[ok]] = moved[ok]
         again[lost[ok]] = True
     return again
 
 
-def _outvote(start: np.ndarray, place: np.ndarray, alive: np.ndarray, group: np.ndarray) -> None:
-    """Points of the group that move otherwise than their neighbors of frame 0 are no longer alive."""
+def _outvote(start: np.ndarray, position: np.ndarray, alive: np.ndarray, group: np.ndarray) -> None:
+    """Mark points of the group as lost if they disagree with the motion of their neighbors in frame 0."""
     points = np.flatnonzero(alive & group)
     if len(points) <= VOTERS:
         return
-    motion = (place - start)[points]
+    motion = (position - start)[points]
     near = cKDTree(start[points]).query(start[points], k=VOTERS + 1)[1][:, 1:]
     off = np.linalg.norm(motion - np.median(motion[near], axis=1), axis=1)
     alive[points[off > CONSENSUS]] = False
 
 
 def _labels_at(labels: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Labels [n] of the pixels nearest to points (x, y)."""
+    """Labels [n] at the pixels nearest to points (x, y)."""
     x, y = np.round(points).astype(int).T
     return np.asarray(labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)])
 
 
 def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -> np.ndarray:
-    """The points (x, y) [n, 2] that lie within `rim` pixels of their own labels [n], as bool [n]."""
+    """True for points (x, y) [n, 2] within `rim` pixels of their own labels [n]."""
     on: np.ndarray = _labels_at(labels, points) == own
     if rim > 0:
         for label in np.unique(own[~on]):
@@ -174,22 +174,22 @@ def _held(labels: np.ndarray, points: np.ndarray, own: np.ndarray, rim: float) -
 
 
 def likeness(first: np.ndarray, now: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Normalized correlation [n] of the patches around the points `here` in the first image and `there` in the other."""
-    one, other = _patches(first, here), _patches(now, there)
-    norms = np.maximum(np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1), 1e-6)
-    return np.asarray((one * other).sum(axis=1) / norms)
+    """Normalized correlation [n] of the patches around `here` in the first image and `there` in the present one."""
+    before, after = _patches(first, here), _patches(now, there)
+    norms = np.maximum(np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1), 1e-6)
+    return np.asarray((before * after).sum(axis=1) / norms)
 
 
 def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The patches [n, PATCH^2] around points (x, y), less their means."""
+    """Patches [n, PATCH^2] around points (x, y), minus their means."""
     offsets = np.stack(np.meshgrid(*[np.arange(PATCH) - PATCH // 2] * 2), axis=-1).reshape(-1, 2)
-    places = (points[:, None] + offsets).reshape(-1, 2)
-    patches = _sample(image.astype(np.float32)[..., None], places).reshape(len(points), -1)
+    pixels = (points[:, None] + offsets).reshape(-1, 2)
+    patches = _sample(image.astype(np.float32)[..., None], pixels).reshape(len(points), -1)
     return np.asarray(patches - patches.mean(axis=1, keepdims=True))
 
 
 def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Bilinear values [n, k] of an image [H, W, k] at points (x, y); the border is continued."""
+    """Bilinear samples [n, k] of an image [H, W, k] at points (x, y); the border is replicated."""
     x, y = points.astype(np.float32).T[..., None]
     parts = [slice(k, k + REMAP_LIMIT) for k in range(0, len(x), REMAP_LIMIT)]
     rows = [cv2.remap(field, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in parts]
@@ -197,12 +197,12 @@ def _sample(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def inside(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The points (x, y) [n, 2] that lie in an image of a shape, as bool [n]."""
+    """True for points (x, y) [n, 2] inside an image of a shape."""
     return np.asarray((points >= 0).all(axis=1) & (points[:, 0] <= shape[1] - 1) & (points[:, 1] <= shape[0] - 1))
 
 
 def equalized(image: np.ndarray) -> np.ndarray:
-    """A gray image [H, W] uint8, less its local mean and divided by its local deviation: what Lucas-Kanade gets."""
+    """Normalize a gray image [H, W] uint8 for Lucas-Kanade: subtract its local mean, divide by its local deviation."""
     centered = image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), EQUALIZED_WIDTH)
     deviation = np.sqrt(cv2.GaussianBlur(centered**2, (0, 0), EQUALIZED_WIDTH) + FAINT**2)
     return np.asarray(np.clip(128.0 + CONTRAST * centered / deviation, 0, 255).astype(np.uint8))

@@ -1,9 +1,9 @@
-"""The arrays of one solver, in the layout that kernels compute in, and sequences of launches captured as graphs.
+"""The arrays of one solver, in the layout of the kernels, and sequences of launches captured as graphs.
 
-B twins lie in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors; one of springs an array [S,
-G] of Numbers; one of a twin an array [G] of Numbers. Torch tensors with the same storage are at hand by name. On a CPU W lanes
-share one thread's instructions; on a GPU W = 1 and a thread is a point of one twin. The twins of a group have one table of
-springs. Lanes that no twin needs repeat the last one of their table.
+B twins are in G groups of W lanes (lanes.py). A quantity of points is an array [points, G] of Vectors, a quantity of springs an
+array [S, G] of Numbers, and a quantity of a twin an array [G] of Numbers. Torch tensors share their storage. On a CPU, W lanes
+share the instructions of one thread. On a GPU W = 1, and a thread computes a point of one twin. The twins of a group share one
+table of springs. Unused lanes repeat the last twin of their table.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -23,16 +23,16 @@ from neuspring.physics.lanes import lanes, width_for
 from neuspring.physics.parameters import PARAMETERS, Parameters
 
 UNFUSED = {"module": "unique", "enable_backward": False, "module_options": {"fuse_fp": False}}
-"""Options of the kernels of a frame. A fused product and sum rounds once, and a GPU fuses where a CPU does not: contacts then flip
-on one of them alone."""
+"""Options of the kernels of a frame. Fused products and sums round only once. GPUs and CPUs fuse differently, which would flip
+contacts on one of them."""
 
 BEHIND = 8
-"""Elements behind the end of an array that blocks read, and do not use (blocks.py)."""
+"""Elements behind the end of an array that blocks read but do not use (blocks.py)."""
 
 
 @functools.cache
 def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
-    """(Model, State, Adjoint): the arguments of every kernel, for a scalar type and a number of lanes."""
+    """Structs (Model, State, Adjoint), the arguments of every kernel, for a scalar type and a number of lanes."""
     lane = lanes(real, width)
     of_twin: Any = wp.array(dtype=lane.Number)
     numbers: Any = wp.array2d(dtype=lane.Number)
@@ -95,7 +95,7 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
 
     kinds = {"spring": vectors, "node": numbers, "twin": of_twin}
     Model.__annotations__ |= {name: kinds[parameter.per] for name, parameter in PARAMETERS.items()}
-    # The part of each node in the gradient of a twin's number.
+    # The gradient of a twin's number is stored per node and summed later.
     kinds["twin"] = numbers
     Adjoint.__annotations__ |= {name: kinds[parameter.per] for name, parameter in PARAMETERS.items() if parameter.trained}
     return wp.struct(Model), State, wp.struct(Adjoint)
@@ -104,11 +104,13 @@ def structs(real: Any, width: int) -> tuple[Any, Any, Any]:
 class Buffers:
     """Torch tensors by name, each with a Warp view of the same storage.
 
-    State: x, v [slots, N + C], nodes first, then controllers; velocities [history, N] `after` the forces, and those that nodes are
-    `moving` with; begin and end [C] of the controllers' path. Every term adds its own arrays.
+    - x, v [slots, N + C]: state of nodes, then controllers
+    - after [history, N]: velocities after the forces
+    - moving [history, N]: velocities after the impulses
+    - begin, end [C]: path of the controllers
 
-    A differentiable solver keeps all substeps of the last frame, slot k before substep k. Otherwise one slot serves where one
-    thread goes through the nodes, and two take turns where each node has a thread.
+    Every term adds its own arrays. A differentiable solver stores all substeps of the last frame, slot k before substep k.
+    Otherwise one slot is sufficient for a single thread, and two slots alternate if each node has a thread.
     """
 
     def __init__(
@@ -124,7 +126,7 @@ class Buffers:
         tables: Sequence[int] = (),
         sizes: Sequence[int] = (),
     ) -> None:
-        """`tables`: the table of springs of each twin, without it the first; `sizes`: nodes of each, without it all."""
+        """`tables`: index of the spring table of each twin (default: 0). `sizes`: number of nodes of each twin (default: all)."""
         start_warp()
         self.nodes, self.controllers, self.simulation = nodes, controllers, simulations[0]
         self.device, self.dtype, self.differentiable, self.threads = device, dtype, differentiable, threads
@@ -150,7 +152,7 @@ class Buffers:
         self.views: dict[str, Any] = {}
         self.indices: dict[str, torch.Tensor] = {}
         self.alike = False
-        """True where all nodes of a twin have the same mass: impulses are then shared in halves."""
+        """True if all nodes of a twin have the same mass; impulses are then divided in halves."""
         self.history = self.substeps if differentiable else 1
         self.slots = self.substeps + 1 if differentiable else 2 if threads else 1
         total = nodes + controllers
@@ -163,18 +165,18 @@ class Buffers:
         self.set_numbers("substep", torch.tensor([s.substep for s in simulations], dtype=dtype, device=device))
         inverse_times = [1.0 / s.frame_time if s.controller_velocity else 0.0 for s in simulations]
         self.set_numbers("inverse_time", torch.tensor(inverse_times, dtype=dtype, device=device))
-        # Without self-collision nothing changes velocities between the forces and the motion.
+        # Without self-collision, velocities do not change between the forces and the motion.
         self.views |= {"moving": self.views["after"]} | ({"adj_moving": self.views["adj_after"]} if differentiable else {})
 
     def add_vectors(self, **shapes: tuple[int, ...]) -> None:
-        """Add arrays of Vectors, zero at first. Only a differentiable solver has adjoints (adj_...)."""
+        """Add arrays of Vectors, initially zero. Only a differentiable solver has adjoints (adj_...)."""
         for name, shape in shapes.items():
             if self.differentiable or not name.startswith("adj_"):
                 tensor = self._zeros(shape, (3, self.width))
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Vector)
 
     def add_numbers(self, **sizes: int | tuple[int, int] | None) -> None:
-        """Add arrays of Numbers: [size, G], or [G] for a number of a twin (None). Adjoints (adj_...) as for Vectors."""
+        """Add arrays of Numbers: [size, G], or [G] for a number per twin (None). Adjoints (adj_...) as for Vectors."""
         for name, size in sizes.items():
             if self.differentiable or not name.startswith("adj_"):
                 shape = () if size is None else (size,) if isinstance(size, int) else size
@@ -182,18 +184,18 @@ class Buffers:
                 self.tensors[name], self.views[name] = tensor, wp.from_torch(tensor, dtype=self.lanes.Number)
 
     def _seat(self, seats: Sequence[int], own: Sequence[int]) -> None:
-        """Take the twin of each lane of each group, and the lane of each twin."""
+        """Store the twin of each lane of each group, and the lane of each twin."""
         self._in_order = own == list(range(self.twins))
         self.seats, self._own = (torch.tensor(places, device=self.device) for places in (seats, own))
 
     def of_twins(self, values: torch.Tensor) -> torch.Tensor:
-        """From [G W, ...] in the order of lanes to [B, ...]."""
+        """Reorder [G W, ...] in the order of lanes to [B, ...]."""
         return values[: self.twins] if self._in_order else values.index_select(0, self._own)
 
     def part(self, twins: slice) -> "Buffers":
-        """The state of some twins, in the same storage; arrays that are added to it are its own.
+        """The state of some twins, in the same storage; arrays added to it are separate.
 
-        They must have nodes in common; their groups may have lanes of others.
+        The twins must have the same nodes. Their groups may contain lanes of other twins.
         """
         first, stop, _ = twins.indices(self.twins)
         own, seats, count = copy.copy(self), self._own[first:stop].tolist(), stop - first
@@ -207,7 +209,7 @@ class Buffers:
         return own
 
     def _zeros(self, shape: tuple[int, ...], entry: tuple[int, ...]) -> torch.Tensor:
-        """Zeros [*shape, G, *entry]. In memory: for threads the twins of a point side by side, else each group's data together."""
+        """Zeros [*shape, G, *entry]. Contiguous in memory: with threads all twins of a point, otherwise all data of a group."""
         kind = {"dtype": self.dtype, "device": self.device}
         if self.threads:
             return torch.zeros((*shape, self.groups, *entry), **kind)
@@ -221,45 +223,45 @@ class Buffers:
             self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
 
     def set_table(self, name: str, shape: tuple[int, ...]) -> None:
-        """Make an array of integers, zero at first, in the place of an earlier one of this name."""
+        """Create an array of integers, initially zero; it replaces an earlier array of this name."""
         self.indices[name] = torch.zeros(shape, dtype=torch.int32, device=self.device)
         self.views[name] = wp.from_torch(self.indices[name], dtype=wp.int32)
         self.__dict__.pop("arguments", None)
 
     def set_span(self, first: int, substeps: int) -> None:
-        """Simulate of a frame the substeps from `first` on, up to `substeps`."""
+        """Simulate only the substeps from `first` to `substeps` of a frame."""
         self.first, self.substeps = first, substeps
         self.__dict__.pop("arguments", None)
 
     def set_vectors(self, name: str, values: torch.Tensor, slot: int | None = None) -> None:
-        """Take [B, P, 3] as the first P points of an array, of one slot where it has slots."""
+        """Copy values [B, P, 3] to the first P points of an array; `slot` selects a slot."""
         target = self.tensors[name] if slot is None else self.tensors[name][slot]
         padded = self._padded(values.detach())
         lanes_last = padded.reshape(self.groups, self.width, values.shape[1], 3).permute(2, 0, 3, 1)
         target[: values.shape[1]].copy_(lanes_last)
 
     def get_vectors(self, name: str, slot: int | None = None, count: int | None = None) -> torch.Tensor:
-        """The first `count` Vectors of an array (None: all), of one slot where it has slots, as [B, P, 3]."""
+        """Return the first `count` Vectors of an array (None: all) as [B, P, 3]; `slot` selects a slot."""
         source = (self.tensors[name] if slot is None else self.tensors[name][slot])[:count]
         twins = source.permute(1, 3, 0, 2).reshape(self.groups * self.width, len(source), 3)
         return self.of_twins(twins).clone()
 
     def set_numbers(self, name: str, values: torch.Tensor) -> None:
-        """Take [B] numbers of twins, or [B, S] of their springs."""
+        """Copy numbers of twins [B], or of their springs [B, S], to an array."""
         padded = self._padded(values.detach())
         rest = padded.shape[1:]
         grouped = padded.reshape(self.groups, self.width, *rest)
         self.tensors[name].copy_(grouped.permute(2, 0, 1) if rest else grouped)
 
     def get_numbers(self, name: str) -> torch.Tensor:
-        """Numbers [size, G] as [B, size]."""
+        """Return Numbers [size, G] as [B, size]."""
         source = self.tensors[name]
         twins = source.permute(1, 2, 0).reshape(self.groups * self.width, len(source))
-        # Contiguous, so that the sum over a twin's numbers takes the same order whatever the width.
+        # Contiguous, so that the order of a sum over a twin's numbers does not depend on the width.
         return self.of_twins(twins).contiguous()
 
     def add_parameters(self, springs: int) -> None:
-        """Add what is declared in parameters.py, and its adjoints."""
+        """Add the parameters declared in parameters.py, and their adjoints."""
         for name, parameter in PARAMETERS.items():
             adjoint = {f"adj_{name}"} if parameter.trained else set()
             if parameter.per == "spring":
@@ -269,7 +271,7 @@ class Buffers:
                 self.add_numbers(**{name: size}, **dict.fromkeys(adjoint, self.nodes))
 
     def set_parameter(self, name: str, values: torch.Tensor) -> None:
-        """Take a parameter with a leading axis [B]; one of springs in the caller's order."""
+        """Copy a parameter with a leading axis [B]; springs are in the caller's order."""
         per = PARAMETERS[name].per
         if per == "spring":
             self.set_vectors(name, values.index_select(1, self.indices["order"]))
@@ -277,12 +279,12 @@ class Buffers:
             self.set_numbers(name, values.expand(-1, self.nodes) if per == "node" else values)
 
     def gradients(self) -> Parameters:
-        """dL/d(parameters) [B, ...] of those that are trained."""
+        """Return dL/d(parameters) [B, ...] of the trained parameters."""
         result = {}
         for name, parameter in PARAMETERS.items():
             if parameter.trained and parameter.per == "spring":
                 own = self.get_vectors(f"adj_{name}")
-                # The kernels leave the factor Y of dL/d(1 / l0) to the end.
+                # The kernels omit the factor Y of dL/d(1 / l0).
                 own[..., 1] *= self.get_vectors(name)[..., 0]
                 result[name] = own.index_select(1, self.indices["ranks"])
             elif parameter.trained:
@@ -291,7 +293,7 @@ class Buffers:
         return result
 
     def _sums(self, of_nodes: torch.Tensor) -> torch.Tensor:
-        """Sums over the nodes of each twin; of other nodes the order of a sum would be another."""
+        """Sum over the nodes of each twin, without padding nodes, which would change the order of the sum."""
         if set(self.sizes) == {self.nodes}:
             return of_nodes.sum(dim=1)
         return torch.cat([of_nodes[k : k + 1, :size].sum(dim=1) for k, size in enumerate(self.sizes)])
@@ -302,7 +304,7 @@ class Buffers:
 
     @functools.cached_property
     def arguments(self) -> tuple[Any, Any, Any]:
-        """(Model, State, Adjoint) of these arrays, made when first asked for: every term has added its own by then."""
+        """(Model, State, Adjoint) of these arrays. They are created at first use, when every term has added its arrays."""
         sim, kinds = self.simulation, structs(self.real, self.width)
         plain = {
             "nodes": self.nodes,
@@ -335,14 +337,14 @@ class Buffers:
 
 
 class Graphs:
-    """Sequences of launches by name; each is recorded at its first run and replayed afterwards."""
+    """Captured sequences of launches by name. The first run records a sequence, later runs replay it."""
 
     def __init__(self, device: str) -> None:
         self.device = device
         self._graphs: dict[str, Any] = {}
 
     def run(self, name: str, kernels: Iterable[Any], record: Callable[[], None]) -> None:
-        """Replay what `record` launches. All of its kernels are loaded before the capture, which must not load any."""
+        """Replay the launches of `record`. All `kernels` are loaded first, because a capture must not load any."""
         if name not in self._graphs:
             for kernel in kernels:
                 load(kernel, self.device)

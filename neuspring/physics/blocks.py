@@ -1,10 +1,11 @@
-"""Springs and colliding pairs of one twin, eight at a time: a processor's vector instructions where no other twins fill its lanes.
+"""Springs and colliding pairs of one twin, eight at a time, with the vector instructions of a CPU.
 
-A block of eight gathers points, turns them into columns x, y and z, computes in columns, and turns the results into points again.
-Equations and order of sums are those of `springs.py` and `collision.py`, so that a twin's numbers are the same, bit for bit, alone
-and in lanes. Warp has no vectors across the elements of an array: this is C++ for its compiler (`wp.func_native`).
+A block of eight gathers points, transposes them to columns x, y and z, computes on columns, and transposes the results back.
+Equations and order of sums are those of `springs.py` and `collision.py`. So a twin's numbers are the same, bit for bit, alone and
+in lanes. Warp has no vectors across the elements of an array, so this is C++ for its compiler (`wp.func_native`).
 
-The last block of a row reads on behind its end and writes nothing there; arrays have `BEHIND` elements more for that.
+The last block of a row reads beyond the end of the row, but writes nothing there. Arrays have `BEHIND` additional elements for
+this.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -17,7 +18,7 @@ from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import MIN_SPRING_LENGTH
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
-# A GPU, where a thread has a node, never comes here.
+# A GPU has one thread per node and never calls this code.
 _COLUMNS = """
 #ifdef __CUDA_ARCH__
     __trap();
@@ -143,7 +144,7 @@ _FORCES_ADJOINT = (
     store(hv + 3 * i, total_v);
 """
 )
-# First the pairs that come closer, with both of their nodes: a branch for each is guessed wrong too often.
+# The approaching pairs are listed first: one branch per pair would be mispredicted too often.
 _PAIRS = """
     const real* x = (const real*)wp::address(state.x, slot, 0, g);
     const real* v = (const real*)wp::address(state.after, inner, 0, g);
@@ -246,9 +247,7 @@ _END = """
 
 @functools.cache
 def functions(real: Any) -> tuple[Any, Any, Any, Any]:
-    """For a scalar type, wp.float32 or wp.float64, and one lane: `springs.add_row` and its adjoint, `collision.add_all_pairs` and
-    its adjoint.
-    """
+    """`springs.add_row`, `collision.add_all_pairs`, each followed by its adjoint, for one lane of wp.float32 or wp.float64."""
     Model, State, Adjoint = structs(real, 1)
     head = _COLUMNS % ("float" if real == wp.float32 else "double", MIN_SPRING_LENGTH, APPROACH, MIN_TANGENT)
 

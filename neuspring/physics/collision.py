@@ -1,13 +1,14 @@
 """Self-collision by impulses between near nodes (Jacobi), and its adjoint.
 
-Node i takes the mean impulse over its listed partners j that are closer than the contact distance and approach, by the response of
-motion.py, of which m_j / (m_i + m_j) is its share: a pair that meets nobody else keeps its momentum.
+Node i receives the mean impulse over its listed partners j that are closer than the contact distance and approach. motion.py
+defines the response. The share of node i is m_j / (m_i + m_j), so a pair without other partners conserves momentum.
 
-Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so that the cost grows with the
-nodes. A list is in node order; where a node has more than `collision_capacity`, those with the lowest indices stay, and the others
-do not meet it.
-The twins of a group share a list: a bit per lane says whose partner a node is. One thread that goes through all nodes has each pair
-once, at its lower node, rows one after the other; threads have each pair at both of its nodes.
+Partners are listed once per frame, from a hash grid with cells as wide as the contact distance, so the cost is proportional to
+the number of nodes. Lists are sorted by node. If a node has more than `collision_capacity` partners, those with the lowest
+indices stay.
+
+The twins of a group share a list; one bit per lane states in which twins a pair is listed. For a single thread, each pair is
+listed once, in the row of its lower node. With one thread per node, each pair is listed at both nodes.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -24,25 +25,25 @@ from neuspring.physics.lanes import lanes
 from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 GRID_CELLS = 64
-"""Cells of the hash grid along each axis; farther cells share them."""
+"""Cells of the hash grid along each axis; cells farther away wrap around."""
 FIRST_PAIRS = 4
-"""Pairs per node that there is room for at first; a frame with more doubles it."""
+"""Initial capacity in pairs per node; a frame with more pairs doubles it."""
 MOST_APART = 0.5
-"""Twins of a group do not share a search if nodes are farther than this many contact distances from those of the first one, but for
-a shift of the whole body. At 0.5 a node's neighborhood holds eight times as many."""
+"""Largest distance of nodes from those of the first twin, in contact distances and without a common shift, up to which the twins
+of a group share a neighbor search. At 0.5, a neighborhood contains eight times as many nodes."""
 MARGIN = 1e-3
-"""Part of the contact distance that is added, for rounding."""
+"""Margin for rounding, as a fraction of the contact distance."""
 
 
 def allocate(b: Buffers) -> None:
-    """Allocate the lists of partners and the velocities after collisions, with self-collision alone."""
+    """Allocate the lists of partners and the velocities after collisions. Without self-collision, nothing is allocated."""
     if not b.simulation.self_collision:
         return
     twins = b.groups * b.width
     device = {"dtype": torch.int32, "device": b.device}
     b.set_table("overflow", (b.nodes, b.groups, b.width))
     if b.threads:
-        # A thread is of one twin: lists of different lanes do not share.
+        # A thread belongs to one twin, so lists are not shared between lanes.
         for name in ("near", "near_lanes"):
             b.set_table(name, (b.nodes, min(b.simulation.collision_capacity, b.nodes), b.groups))
         b.set_table("near_count", (b.nodes, b.groups))
@@ -64,7 +65,7 @@ def allocate(b: Buffers) -> None:
 
 
 def overflow(b: Buffers) -> torch.Tensor:
-    """Candidates that did not fit the lists so far, of each twin [B]."""
+    """Candidates of each twin that exceeded the lists so far [B]."""
     if not b.simulation.self_collision:
         return torch.zeros(b.twins, dtype=torch.int64)
     return b.of_twins(b.indices["overflow"].sum(dim=0).reshape(-1)).cpu()
@@ -82,7 +83,7 @@ def find_candidates(b: Buffers, reach: float) -> None:
     model, state, _ = b.arguments
     spread = _apart(b)
     looks = 1 if spread <= MOST_APART * reach else b.width
-    # A pair that is near in some lane is at most this much wider in the first.
+    # Nodes that are near in any lane are at most this much farther apart in the first lane.
     wider = 2 * spread + MARGIN * reach if looks < b.width else 0.0
     b.launch(place, size, model, state, looks, views["grid_points"])
     count = b.groups * looks * b.nodes
@@ -101,7 +102,7 @@ def find_candidates(b: Buffers, reach: float) -> None:
 
 
 def _apart(b: Buffers) -> float:
-    """The largest distance of a node in any lane from that in the first, but for a shift of the whole body, m."""
+    """The largest distance of a node in any lane from the same node in the first lane, without a common shift, m."""
     if b.width == 1:
         return 0.0
     ways = b.tensors["x"][0, : b.nodes]
@@ -127,7 +128,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
             grid_points[(g * looks + q) * model.nodes + i] = column(state.x[0, i, g], q)
 
     def find(model: Model, state: State, grid: wp.uint64, overflow: counts):
-        """The sorted list of a node, by a thread of its own, which has one lane."""
+        """List the partners of a node, sorted; one thread per node, one lane."""
         i, g = wp.tid()
         count = wp.int32(0)
         here = column(state.x[0, i, g], 0)
@@ -138,7 +139,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
             if j != i and wp.length(column(state.x[0, j, g], 0) - here) < model.distance[g][0]:
                 keep = True
                 if count == model.capacity:
-                    # The last partner makes room for one that comes before it.
+                    # A candidate before the last partner replaces it.
                     overflow[i, g, 0] = overflow[i, g, 0] + 1
                     keep = j < model.near[i, count - 1, g]
                     count = wp.where(keep, count - 1, count)
@@ -154,14 +155,14 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def listed(model: Model, i: int, g: int, j: int) -> int:
-        """1 if j is a partner of node i, else 0."""
+        """Return the lanes in which j is a partner of node i, else 0."""
         for k in range(model.near_count[i, g]):
             if model.near[i, k, g] == j:
                 return model.near_lanes[i, k, g]
         return 0
 
     def agree(model: Model, overflow: counts):
-        """A node that was dropped by a partner drops it too: a pair is one for both. The order of threads makes no difference."""
+        """Remove pairs that the list of one of their nodes dropped. The order of threads does not matter."""
         i, g = wp.tid()
         for k in range(model.near_count[i, g]):
             j = model.near[i, k, g]
@@ -170,7 +171,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def within(offset: Vector, distance: Number, own: Number) -> Number:
-        """1 in the lanes in which a pair is near, of those in which `own` is 1."""
+        """Return 1 in lanes in which a pair is near and `own` is 1."""
         length = root(dot(offset, offset))
         near = Number()
         for q in range(width):
@@ -179,7 +180,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def paired(model: Model, g: int, first: int, count: int, j: int, mask: int) -> int:
-        """Make j a partner in the lanes of a mask of the node whose row begins at `first`; the new length of the sorted row."""
+        """Add partner j, in the lanes of a mask, to the sorted row that begins at `first`; return the new length of the row."""
         p = count
         while p > 0 and model.pair_other[g, first + p - 1] > j:
             p = p - 1
@@ -197,7 +198,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def parted(model: Model, g: int, first: int, count: int, q: int) -> int:
-        """Take the last partner in lane q out of the row that begins at `first`; the new length."""
+        """Remove the last partner in lane q from the row that begins at `first`; return the new length of the row."""
         k = first + count - 1
         while (model.pair_lanes[g, k] >> q) & 1 == 0:
             k = k - 1
@@ -210,10 +211,10 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
         return count - 1
 
     def find_pairs(model: Model, state: State, grid: wp.uint64, looks: int, wider: real, lower: numbers, overflow: counts):
-        """The rows of a group, by a look around each node in each lane, or a wider one in the first for all; -1 for the end of the
-        last row where there was no room.
+        """List the rows of a group: search around each node in each lane, or in a wider radius in the first lane for all lanes.
 
-        `lower` counts partners before a node: as rows ascend it is the rank, among the other's, of the node whose row is made.
+        Sets the end of the last row to -1 if the capacity is too small. `lower` counts partners with lower indices. As rows
+        ascend, it is the rank of the current node among the partners of the other node.
         """
         g = wp.tid()
         room = model.pair_other.shape[1] - BEHIND
@@ -270,7 +271,7 @@ def kernels(real: Any, width: int) -> tuple[Any, Any, Any, Any]:
 def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
     """(collided, add_all_pairs, after_pairs, adjoints of the first two) for a scalar type, wp.float32 or wp.float64, and lanes.
 
-    A thread per node gathers (`collided`); one thread for all adds each pair to both of its nodes.
+    With one thread per node, `collided` gathers impulses. A single thread adds each pair to both of its nodes (`add_all_pairs`).
     """
     lane = lanes(real, width)
     Number, Vector, plain = lane.Number, lane.Vector, lane.plain
@@ -282,7 +283,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def whole(value: real) -> Number:
-        """The same in every lane."""
+        """Return the same value in every lane."""
         result = Number()
         for q in range(width):
             result[q] = value
@@ -290,12 +291,12 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def closes(offset: Vector, relative: Vector) -> bool:
-        """True where a pair comes closer in any lane. Almost half do not, and need no more than this."""
+        """Return True if a pair approaches in any lane. Almost half of the pairs do not, and need no further work."""
         return wp.min(dot(offset, relative)) < -approach
 
     @wp.func
     def meeting(offset: Vector, relative: Vector, own: Number, distance: Number) -> Number:
-        """1 in the lanes in which a pair meets, of those in which it is listed (`own` is 1)."""
+        """Return 1 in lanes in which a listed pair (`own` is 1) collides."""
         length = root(dot(offset, offset))
         closing = dot(offset, relative)
         meets = Number()
@@ -305,14 +306,14 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def part(model: Model, own: Number, other: Number) -> Number:
-        """m_j / (m_i + m_j) of the inverse masses of i and j."""
+        """Return m_j / (m_i + m_j) from the inverse masses of i and j."""
         if model.alike != 0:
             return half
         return wp.cw_div(own, own + other)
 
     @wp.func
     def impulse(dx: Vector, u: Vector, e: Number, mu: Number) -> Vector:
-        """Velocity that a node gains from a partner at dx that moves at u, before its share."""
+        """Impulse of a partner at dx that moves at u, as a velocity, before multiplication by the share of the node."""
         n = divided(dx, wp.max(root(dot(dx, dx)), whole(floor)))
         s = dot(u, n)
         ut = u - scaled(n, s)
@@ -323,7 +324,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def collided(model: Model, state: State, slot: int, inner: int, i: int, g: int) -> Vector:
-        """Velocities of node i after the impulses of all its partners."""
+        """Velocity of node i after the impulses of all its partners."""
         x = state.x[slot, i, g]
         v = state.after[inner, i, g]
         total = Vector()
@@ -345,7 +346,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def add_pairs(model: Model, state: State, slot: int, inner: int, i: int, g: int):
-        """Add the impulses of node i and its later partners to `moving` and `met` of both: each pair once, the same sums."""
+        """Add the impulses of node i and its later partners to `moving` and `met` of both nodes, each pair once."""
         x = state.x[slot, i, g]
         v = state.after[inner, i, g]
         total = state.moving[inner, i, g]
@@ -369,18 +370,18 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def add_all_pairs(model: Model, state: State, slot: int, inner: int, g: int):
-        """`add_pairs` of all nodes."""
+        """Call `add_pairs` for all nodes."""
         for i in range(model.nodes):
             add_pairs(model, state, slot, inner, i, g)
 
     @wp.func
     def after_pairs(state: State, inner: int, i: int, g: int) -> Vector:
-        """Velocities of node i after the impulses that `add_pairs` has added."""
+        """Velocity of node i after the impulses of `add_pairs`."""
         return state.after[inner, i, g] - divided(state.moving[inner, i, g], wp.max(state.met[inner, i, g], whole(one)))
 
     @wp.func
     def pair_adjoint(dx: Vector, u: Vector, e: Number, mu: Number, h: Vector):
-        """Adjoints of dx, u, e and mu for h, that of the impulse; the node's share is in h."""
+        """Adjoints of dx, u, e and mu, from the adjoint h of the impulse; h includes the share of the node."""
         ones = whole(one)
         inverse = wp.cw_div(ones, wp.max(root(dot(dx, dx)), whole(floor)))
         n = scaled(dx, inverse)
@@ -397,7 +398,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
         hn = scaled(h, -wp.cw_mul(a + e, s))
         hu = scaled(h, a - ones)
         he = -wp.cw_mul(s, along)
-        # Where friction does not stop the pair, and where it has a direction.
+        # slides: friction does not stop the pair. turns: the tangential velocity also has a direction.
         slides = Number()
         turns = Number()
         for q in range(width):
@@ -421,7 +422,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def add_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int, j: int, mask: int, own: Vector):
-        """Add to the adjoints of x and velocities of a pair, and of e and mu; `own` is that of the mean impulse of i."""
+        """Add the adjoints of a pair to those of x, velocities, e and mu. `own` is the adjoint of the mean impulse of node i."""
         offset = state.x[step, j, g] - state.x[step, i, g]
         relative = state.after[step, j, g] - state.after[step, i, g]
         light = model.inverse_mass[i, g]
@@ -439,9 +440,10 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def collided_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """Adjoint of `collided`, of node i and its later pairs: dL/d(velocities after impulses) -> dL/d(those before, x, e, mu).
+        """Adjoint of `collided` for node i and its later partners: dL/d(velocities after impulses) -> dL/d(velocities before, x,
+        e, mu).
 
-        `adjoint.after` begins as `adjoint.moving`.
+        `adjoint.after` starts as a copy of `adjoint.moving`.
         """
         if wp.max(state.met[step, i, g]) == zero:
             return
@@ -455,7 +457,7 @@ def functions(real: Any, width: int) -> tuple[Any, Any, Any, Any, Any]:
 
     @wp.func
     def add_pairs_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """The same by one thread for all."""
+        """`collided_adjoint` for a single thread."""
         if wp.max(state.met[step, i, g]) == zero:
             return
         own = mean_adjoint(state, adjoint, step, i, g)

@@ -1,12 +1,12 @@
-"""Controllers: where they are in each frame, which of them hold, and the springs of those that take hold later than in frame 0.
+"""Controllers: their positions in each frame, which of them hold, and the springs of grasps that begin after frame 0.
 
-At the frame in which a controller at x_c begins to hold, spring (c, n) with stiffness Y and rest length l0 becomes
+In the frame in which a controller at x_c begins to hold, spring (c, n) with stiffness Y and rest length l0 gets
 
     l0' = |x_c - x_n|,   Y' = Y l0' / l0,
 
-with x_n where the simulated node is then. So the springs have no force at that moment, and Y' / l0' = Y / l0: force per length, and
-with it the substep that was found stable, stay. Both are functions of the state of that frame, and of the parameters: gradients go
-through them, exactly. Springs that only push keep their lengths.
+where x_n is the position of the simulated node in that frame. So the spring starts without force. Y' / l0' = Y / l0, so the force
+per length and the stable substep do not change. Gradients pass through l0' and Y' exactly. Springs that only push keep their rest
+length.
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ import torch
 from neuspring.physics.lanes import MIN_SPRING_LENGTH
 
 BEGINS = 2.0
-"""Value in the last column of a row of waypoints: the controller begins to hold in this frame."""
+"""Value in the last column of waypoints for a controller that begins to hold in this frame."""
 
 
 def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Tensor:
-    """Rows that a solver takes for `begin` and `end` of frames, one row per frame: hands [T, C, 3], m.
+    """Waypoints for a solver, which uses one row as `begin` and the next as `end` of a frame.
 
-    Where some controller does not hold in some frame (`valid` [T', C], T' >= T; empty or none: all hold), a last column has 1 or 0,
-    and 2 where it begins to hold, but in frame 0. The springs of a controller act in a frame if it holds at both ends of the frame.
-    When it begins to hold they take the rest lengths of that moment.
+    - hands: positions of the controllers [T, C, 3], m
+    - valid: frames in which each controller holds [T', C], T' >= T; empty or None: all frames
+
+    If some controller does not hold in some frame, the result has a fourth column: 1 if the controller holds, 2 if it begins to
+    hold after frame 0, 0 otherwise. Springs of a controller act in a frame if it holds at both ends of the frame. Their rest
+    lengths are reset when the controller begins to hold.
     """
     if valid is None or valid.all():
         return hands
@@ -35,17 +38,17 @@ def waypoints(hands: torch.Tensor, valid: np.ndarray | None = None) -> torch.Ten
 
 
 def begins(row: torch.Tensor) -> torch.Tensor:
-    """True for the controllers [..., C] of a row of waypoints that begin to hold; none where it has no such column."""
+    """True for the controllers [..., C] of a row of waypoints that begin to hold; rows without a fourth column have none."""
     return row[..., 3] == BEGINS if row.shape[-1] == 4 else torch.zeros(row.shape[:-1], dtype=torch.bool, device=row.device)
 
 
 def begun(row: torch.Tensor) -> torch.Tensor:
-    """The row after its grips were taken: who begins holds."""
+    """The row of waypoints after its grasps have begun: 2 becomes 1 in the fourth column."""
     return torch.cat([row[..., :3], row[..., 3:].clamp(max=1.0)], dim=-1) if row.shape[-1] == 4 else row
 
 
 class ControllerSprings:
-    """The springs of controllers among spring_pairs [S, 2]; i >= nodes means controller i - nodes."""
+    """The controller springs among spring_pairs [S, 2]; i >= nodes means controller i - nodes."""
 
     def __init__(self, spring_pairs: np.ndarray, nodes: int, device: str) -> None:
         ends = np.sort(np.asarray(spring_pairs).reshape(-1, 2), axis=1)
@@ -53,12 +56,14 @@ class ControllerSprings:
         self.springs, self.nodes, self.leaders = (
             torch.tensor(values, dtype=torch.long, device=device) for values in (led, ends[led, 0], ends[led, 1] - nodes)
         )
-        """Springs of controllers [L], the node and the controller of each."""
+        """Indices of the controller springs [L], and the node and the controller of each."""
 
     def taken(self, lengths: torch.Tensor | None, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor | None:
-        """Rest lengths [..., L], m, after the grips that begin in a frame; 0 where a spring's own holds; None: everywhere.
+        """Rest lengths [..., L], m, after the grasps that begin in a frame; 0: a spring keeps its own; None: all do.
 
-        `lengths` are those before, x [..., N, 3], m, the nodes in that frame, and `row` [..., C, K] its waypoints.
+        - lengths: rest lengths before the frame
+        - x: nodes in the frame [..., N, 3], m
+        - row: waypoints of the frame [..., C, K]
         """
         now = begins(row)
         if not bool(now.any()):
@@ -68,7 +73,7 @@ class ControllerSprings:
         return torch.where(now[..., self.leaders], apart, before)
 
     def applied(self, packed: torch.Tensor, lengths: torch.Tensor | None) -> torch.Tensor:
-        """Parameters [..., S, 3] of springs with rest lengths [..., L], and the stiffness that goes with them."""
+        """Apply rest lengths [..., L] of grasps, and the resulting stiffness, to the parameters of springs [..., S, 3]."""
         if lengths is None:
             return packed
         stiffness, inverse, dashpot = packed[..., self.springs, :].unbind(dim=-1)

@@ -1,8 +1,10 @@
-"""A frame as kernels, forward and backward, from the terms' functions.
+"""A frame as kernels, forward and backward, composed of the functions of the terms.
 
-`serial`: one thread goes through all nodes and all substeps, each spring once, the way of a CPU, whose width is in the lanes.
-`threads`: a thread per node of each twin and a launch per substep, each spring gathered at both ends without atomics, the way of
-a GPU. Both sum a node's forces in the same order.
+- CPU: one thread per group computes all nodes and substeps in one launch, and each spring once. Lanes are the parallel direction.
+- GPU (`threads`): one thread per node of each twin, one launch per substep. Each spring is gathered at both ends, without
+  atomics.
+
+Both sum the forces of a node in the same order.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -22,16 +24,17 @@ class Kernels(NamedTuple):
     forward: Any
     """A frame on one thread per group."""
     backward: Any
+    """The adjoint of `forward`."""
     begin: Any
-    """Controllers at the end of the first substep, by a thread each."""
+    """Controllers at the end of the first substep, one thread each."""
     substep: Any
-    """A substep by a thread per point; with self-collision without its second half."""
+    """A substep, one thread per point. With self-collision only its first half: forces and velocity."""
     collide: Any
-    """The second half: impulses, motion."""
+    """The second half of a substep with self-collision: impulses and motion."""
     settle: Any
-    """Adjoint of motion, velocity: from dL/d(x', v') to dL/d(x, v, force) of a substep."""
+    """Adjoint of motion and velocity: from dL/d(x', v') to dL/d(x, v, force) of a substep."""
     pull: Any
-    """Adjoint of the springs of a substep; without self-collision then also that of motion and velocity of the substep before."""
+    """Adjoint of the springs of a substep. Without self-collision, also `settle` of the previous substep."""
     hit: Any
     """Adjoint of the impulses."""
     slow: Any
@@ -40,7 +43,7 @@ class Kernels(NamedTuple):
 
 @functools.cache
 def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
-    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes; with springs that only push, or without any."""
+    """Kernels for a scalar type, wp.float32 or wp.float64, and a number of lanes. `pushes`: some springs only push."""
     lane = lanes(real, width)
     Vector, Number, chosen, chosen_number = lane.Vector, lane.Number, lane.chosen, lane.chosen_number
     Model, State, Adjoint = structs(real, width)
@@ -51,7 +54,7 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
 
     @wp.func
     def advance(model: Model, state: State, step: int, i: int, g: int, moving: Vector):
-        """x' and v' of node i; a twin that is at the end of its frame stays."""
+        """Store x' and v' of node i. A twin that has reached the end of its frame stays in place."""
         slot = step % model.slots
         x, v = moved(state.x[slot, i, g], moving, model.substep[g], model.up, model.ground_e[g], model.ground_mu[g])
         if step >= model.fewest:
@@ -63,7 +66,7 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
 
     @wp.func
     def advance_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """Adjoint of `advance`: dL/d(x', v') -> dL/d(x) and dL/d(velocity that the node moves with)."""
+        """Adjoint of `advance`: dL/d(x', v') -> dL/d(x) and dL/d(`moving`)."""
         adj_x, adj_v, adj_e, adj_mu = moved_adjoint(
             state.x[step, i, g],
             state.moving[step, i, g],
@@ -91,7 +94,7 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
 
     @wp.func
     def update_adjoint(model: Model, state: State, adjoint: Adjoint, step: int, i: int, g: int):
-        """Adjoint of `update`: dL/d(velocity after the forces) -> dL/d(v, force, drag's factor)."""
+        """Adjoint of `update`: dL/d(velocity after the forces) -> dL/d(v, force, decay)."""
         adj_v, adj_force, adj_decay = updated_adjoint(
             state.after[step, i, g], adjoint.after[i, g], model.substep[g], model.decay[g], model.inverse_mass[i, g]
         )
@@ -120,14 +123,14 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
                 for i in range(model.nodes):
                     state.moving[inner, i, g] = Vector()
                     state.met[inner, i, g] = Number()
-                add_all_pairs(model, state, slot, inner, g)  # v' += mean impulse from the partners that are hit
+                add_all_pairs(model, state, slot, inner, g)  # v' += mean impulse from the colliding partners
                 for i in range(model.nodes):
                     moving = after_pairs(state, inner, i, g)
                     state.moving[inner, i, g] = moving
                     advance(model, state, step, i, g, moving)
 
     def backward(model: Model, state: State, adjoint: Adjoint):
-        """The adjoints of `forward`, last line first."""
+        """The adjoints of `forward`, in reverse order."""
         g = wp.tid()
         for done in range(model.substeps):
             step = model.substeps - 1 - done
@@ -158,7 +161,7 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
         i, g = wp.tid()
         slot = step % model.slots
         if i >= model.nodes:
-            # The controllers' place in the next substep, which nobody reads in this one.
+            # The position of a controller in the next substep; this substep does not read it.
             move_controller(model, state, step + 1, (step + 1) % model.slots, i - model.nodes, g)
             return
         force = gathered(model, state, slot, i, g)
@@ -175,7 +178,7 @@ def kernels(real: Any, width: int, pushes: bool = True) -> Kernels:
         advance(model, state, step, i, g, moving)
 
     def of_node(adjoint_of_node: Any) -> Any:
-        """The kernel that calls an adjoint for each node."""
+        """Return a kernel that calls an adjoint for each node."""
 
         def kernel(model: Model, state: State, adjoint: Adjoint, step: int):
             i, g = wp.tid()

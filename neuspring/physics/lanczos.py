@@ -1,6 +1,6 @@
-"""The largest eigenvalue of the stiffness or damping matrix of a net of springs, by Lanczos' method.
+"""The largest eigenvalue of the stiffness or damping matrix of a spring network, by Lanczos' method.
 
-A product with the matrix is a pass over the springs in a kernel; nothing is assembled.
+A kernel computes products with the matrix in a pass over the springs, without assembling the matrix.
 """
 # No postponed annotations here: Warp reads the evaluated types of the kernel.
 
@@ -14,7 +14,7 @@ from neuspring.core.device import load, start_warp
 from neuspring.physics.arrays import UNFUSED
 
 STEPS, MOST = 10, 200
-"""Vectors by which a subspace grows before its eigenvalue is looked at, and the most that it has."""
+"""Number of vectors by which the subspace grows between two convergence checks, and its largest size."""
 
 
 def largest(
@@ -22,9 +22,11 @@ def largest(
 ) -> list[tuple[float, int]]:
     """The largest eigenvalue of A = D B^T diag(w) B D for `each` w [S], and the point that moves most in its mode.
 
-    springs [S, 2] of points P have unit vectors `direction` [S, 3]. Row e of B maps velocities of points to the rate of change of
-    spring e's length; D = diag(`scale` [P]), 0 for points that do not move. The residual is at most `tolerance` times the value.
-    Where it stays larger it is added to the value.
+    - springs: [S, 2], indices of P points
+    - direction: unit vectors of the springs [S, 3]. Row e of B maps velocities of points to the rate of change of spring e's
+      length
+    - scale: [P], D = diag(scale); 0 for fixed points
+    - tolerance: largest residual, relative to the eigenvalue. A residual that stays larger is added to the eigenvalue
     """
     from scipy.linalg import eigh_tridiagonal
 
@@ -66,7 +68,7 @@ def subspace(
     diagonal: wp.array[wp.float64],
     beside: wp.array[wp.float64],
 ):
-    """Vectors known + 1 .. size of the basis, and the matrix projected on it, which is tridiagonal."""
+    """Compute vectors known + 1 .. size of the basis, and the tridiagonal projection of the matrix."""
     for step in range(known, size):
         for i in range(rest.shape[0]):
             rest[i] = wp.vec3d()

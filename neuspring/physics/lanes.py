@@ -1,8 +1,8 @@
-"""Numbers and 3-vectors of several twins at once: the lanes that every kernel of the simulator computes in.
+"""Numbers and 3-vectors of several twins at once: the types of every kernel of the simulator.
 
-A `Number` holds one scalar of each of W twins, a `Vector` three rows of W: x, y, z. A processor's vector unit works on all lanes
-in one instruction, and every load is contiguous. W = 1 is a twin alone: the same sums in the same order, so that a twin's numbers
-do not depend on its company.
+A batch lane is one of W twins that share vector instructions. A `Number` contains one scalar per lane, a `Vector` three rows of
+W: x, y, z. Vector instructions compute all lanes at once, and all loads are contiguous. W = 1 is a single twin. The order of sums
+is the same for any W, so a twin's numbers do not depend on its batch.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import warp as wp
 
 MIN_SPRING_LENGTH = 1e-6
-"""Lengths are floored here when a direction is formed, m."""
+"""Smallest length in the division for a direction, m."""
 LANE_WIDTH = 8
-"""Twins that share vector instructions. 16 were no faster per twin (results/published/bench/NOTES.md)."""
+"""Number of twins that share vector instructions; 16 are not faster per twin (results/published/bench/NOTES.md)."""
 ALONE = 2
-"""Up to so many twins are faster one by one, in blocks (blocks.py): one takes 0.42 of the time of eight in lanes."""
+"""Number of twins up to which blocks (blocks.py) are faster than lanes: one twin takes 0.42 of the time of eight in lanes."""
 
 
 def width_for(twins: int) -> int:
-    """Lanes for so many twins."""
+    """Number of lanes for `twins` twins."""
     return LANE_WIDTH if twins > ALONE else 1
 
 
@@ -40,7 +40,7 @@ class Lanes(NamedTuple):
     root: Any
     """Number -> its square root."""
     divided: Any
-    """(Vector, Number) -> the Vector over it."""
+    """(Vector, Number) -> the Vector divided by the Number."""
     floored: Any
     """Number -> max(number, MIN_SPRING_LENGTH)."""
     column: Any
@@ -48,11 +48,11 @@ class Lanes(NamedTuple):
     put: Any
     """(Vector, lane, vec3) -> the Vector with one lane replaced."""
     chosen: Any
-    """(step, counts, Vector, Vector) -> the first where a lane is still moving (step < count), else the second."""
+    """(step, counts, Vector, Vector) -> the first Vector in lanes that still move (step < count), else the second."""
     chosen_number: Any
-    """The same for Numbers."""
+    """`chosen` for Numbers."""
     plain: Any
-    """An index -> the same, plainly not negative: Warp looks at the sign of every other one, a sixth of a spring's time."""
+    """Index -> the same index, marked as not negative. Warp checks the sign of other indices, a sixth of a spring's time."""
 
 
 @functools.cache

@@ -1,18 +1,18 @@
-"""Motion: controllers, the velocity update, and positions with or without a ground plane z = 0 (the paper's equation 4); adjoints.
+"""Motion and its adjoints: controllers, velocities, and positions with or without a ground plane z = 0 (the paper's equation 4).
 
     x_c = begin + (end - begin) (k + 1) / n in substep k of n
     v' = (v + dt (f / m + g)) delta,   delta = exp(-dt drag)
     x' = x + dt v'
 
-Drag is dv/dt = -drag v; its exact solution is taken over a substep, so any value is stable. The mass m is 1 kg if none is given.
+Drag is dv/dt = -drag v. The update uses the exact solution over a substep, so any value is stable. The default mass m is 1 kg.
 
-With ground, a node that would be below at the end of the substep and moves down is reflected at its time of impact toi = -z / v_z:
-x' = x + v toi + v' (dt - toi). The response is that of all contacts (collision.py), an impulse with elasticity e in
-[0, 1] and friction mu in [0, 2]: a relative velocity u = u_n + u_t (normal, tangential) becomes
+With ground, a node that moves down and would be below ground at the end of the substep is reflected at its time of impact toi =
+-z / v_z: x' = x + v toi + v' (dt - toi). All contacts (collision.py) have the same response, an impulse with elasticity e in [0,
+1] and friction mu in [0, 2]. It changes a relative velocity u = u_n + u_t (normal, tangential) to
 
     -e u_n + a u_t,   a = max(0, 1 - mu (1 + e) |u_n| / |u_t|).
 
-The same in float64: `reference.bounce`.
+`reference.bounce` is the float64 specification.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -25,16 +25,16 @@ from neuspring.physics.arrays import structs
 from neuspring.physics.lanes import lanes
 
 APPROACH = 1e-4
-"""Slower approaches do not collide (m/s for the ground; m^2/s, distance times speed, for pairs)."""
+"""Slowest approach that collides: m/s for the ground; m^2/s, distance times speed, for pairs."""
 MIN_TANGENT = 1e-6
-"""Tangential speeds are floored here when dividing, m/s."""
+"""Smallest tangential speed in divisions, m/s."""
 
 
 @functools.cache
 def velocity(real: Any, width: int) -> tuple[Any, Any, Any]:
     """Three functions for a scalar type, wp.float32 or wp.float64, and a number of lanes:
 
-    move_controller    puts a controller where it is at the end of a substep
+    move_controller    moves a controller to its position at the end of a substep
     updated            (v, force, gravity, dt, delta, 1 / m) -> v'
     updated_adjoint    (v', dL/dv', dt, delta, 1 / m) -> dL/d(v), dL/d(force), dL/d(delta)
     """
@@ -58,7 +58,7 @@ def velocity(real: Any, width: int) -> tuple[Any, Any, Any]:
 
     @wp.func
     def updated_adjoint(after: Vector, adj_after: Vector, dt: Number, decay: Number, light: Number):
-        # In terms of v' alone: the substep keeps neither the force nor the velocity before the drag.
+        # In terms of v' only, because a substep stores neither the force nor the velocity before drag.
         adj_decay = wp.cw_div(dot(adj_after, after), decay)
         adj_v = scaled(adj_after, decay)
         return adj_v, scaled(scaled(adj_v, dt), light), adj_decay
@@ -81,12 +81,12 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
 
     @wp.func
     def count() -> int:
-        """The width, but no constant: what is rarely done is not unrolled."""
+        """The width, but not as a constant, so that loops over rare cases are not unrolled."""
         return wp.int32(width)
 
     @wp.func
     def falls(z: real, speed: real, dt: real, up: real) -> bool:
-        """True for a node that would be below at the end of the substep and moves down; never without ground (up = 0)."""
+        """True if a node moves down and would be below ground at the end of the substep; False without ground (up = 0)."""
         return (z + speed * dt) * up < zero and speed * up < -approach
 
     @wp.func
@@ -99,7 +99,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
     def moved(p: Vector, w: Vector, dt: Number, up: real, e: Number, mu: Number):
         x = p + scaled(w, dt)
         v = w
-        # Almost no node is at the ground: one look at all lanes first.
+        # Few nodes are at the ground, so one check of all lanes comes first.
         if wp.min(x[2] * up) < zero:
             for q in range(count()):
                 if falls(p[2, q], w[2, q], dt[q], up):
@@ -111,7 +111,7 @@ def position(real: Any, width: int) -> tuple[Any, Any]:
 
     @wp.func
     def bounce_adjoint(p: vec3, w: vec3, dt: real, e: real, mu: real, hx: vec3, hv: vec3):
-        """Adjoints of x, v, e and mu of a node that is reflected."""
+        """Adjoints of x, v, e and mu of a reflected node."""
         t = wp.sqrt(w[0] * w[0] + w[1] * w[1])
         tf = wp.max(t, floor)
         a = wp.max(zero, one - mu * (one + e) * wp.abs(w[2]) / tf)

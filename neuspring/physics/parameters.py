@@ -1,7 +1,7 @@
-"""Physical parameters: what the kernels take, how each follows from a material, and whether it has a gradient.
+"""Physical parameters of the kernels: how each follows from a material, and whether it has a gradient.
 
-Each is declared once, in `PARAMETERS`. Kernels' arguments (arrays.py), buffers, gradients and twins side by side (solver.py) follow
-from that by name.
+`PARAMETERS` declares each parameter once. Kernel arguments and buffers (arrays.py), gradients and unions of twins (union.py)
+follow from it by name.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from neuspring.core.artifacts import Material, Twin
 Values = Mapping[str, torch.Tensor]
 """Fields of `Material` by name, rest_lengths [S], m, and pushes [S]."""
 Parameters = dict[str, torch.Tensor]
-"""Result of `pack`: a tensor per name of `PARAMETERS`. Several twins have a leading axis [B]."""
+"""Result of `pack`: a tensor per name of `PARAMETERS`, with a leading axis [B] for several twins."""
 CONTACT_LIMITS = {
     f"{kind}_{name}": limits
     for kind in ("ground", "contact")
     for name, limits in {"elasticity": (0.0, 1.0), "friction": (0.0, 2.0)}.items()
 }
-"""Fields of `Material` that are clamped on use, as in the released simulator."""
+"""Limits of the contact fields of `Material`. Values are clamped on use, as in the released simulator."""
 
 
 class KernelParameter(NamedTuple):
     """One argument of the kernels."""
 
     per: Literal["spring", "node", "twin"]
-    """A Vector per spring, a Number per node, or a Number of the twin."""
+    """A Vector per spring, a Number per node, or a Number per twin."""
     pack: Callable[[Values, float | torch.Tensor], torch.Tensor]
-    """(values of the material, substep, s) -> [S, 3], [N] or []."""
+    """(values of the material, substep in s) -> [S, 3], [N] or []."""
     trained: bool = True
-    """True where gradients reach it."""
+    """True if it has a gradient."""
 
 
 def _springs(values: Values, substep: float | torch.Tensor) -> torch.Tensor:
@@ -56,45 +56,46 @@ def _clamped(name: str) -> Callable[[Values, float | torch.Tensor], torch.Tensor
 
 
 PARAMETERS = {
-    # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring with neither stiffness nor dashpot is absent; one whose
-    # 1 / rest length is negative only pushes.
+    # Stiffness Y [N], 1 / rest length [1/m], dashpot [N s/m]. A spring without stiffness and dashpot is absent. A spring with a
+    # negative 1 / rest length only pushes.
     "springs": KernelParameter("spring", _springs),
-    # The factor of velocities that drag leaves in a substep.
+    # Factor of drag on velocities per substep.
     "decay": KernelParameter("twin", lambda values, substep: torch.exp(-substep * values["drag"])),
     "ground_e": KernelParameter("twin", _clamped("ground_elasticity")),
     "ground_mu": KernelParameter("twin", _clamped("ground_friction")),
     "contact_e": KernelParameter("twin", _clamped("contact_elasticity")),
     "contact_mu": KernelParameter("twin", _clamped("contact_friction")),
-    # m. It only selects pairs.
+    # m. It only selects pairs, so it has no gradient.
     "distance": KernelParameter("twin", lambda values, substep: values["contact_distance"], trained=False),
-    # 1/kg; [1] where all nodes have 1 kg. Masses are not trained.
+    # 1/kg; [1] if all nodes have 1 kg. Masses are not trained.
     "inverse_mass": KernelParameter("node", _inverse_mass, trained=False),
 }
 
 
 def pack(*, substep: float | torch.Tensor, **values: torch.Tensor) -> Parameters:
-    """Pack physical parameters, differentiably, for a substep in s.
+    """Pack physical parameters, differentiably.
 
-    `values` are the fields of `Material`, of which those with a default may be left out, rest_lengths [S], m, and pushes [S] where
-    some only push; dashpot may be one number for all springs.
+    - substep: s
+    - values: fields of `Material`, rest_lengths [S], m, and pushes [S] if some springs only push. Fields with a default may be
+      missing. dashpot may be one number for all springs
     """
     return {name: parameter.pack(values, substep) for name, parameter in PARAMETERS.items()}
 
 
 def packed(twin: Twin, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Parameters:
-    """A twin's parameters, packed."""
+    """Pack the parameters of a twin."""
     return pack(**twin_tensors(twin, device, dtype), substep=twin.simulation.substep)
 
 
 def twin_tensors(twin: Twin, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
-    """A twin's physical parameters as tensors, with the keyword names of `pack`."""
+    """The physical parameters of a twin as tensors, with the keyword names of `pack`."""
     values = {f.name: getattr(twin.material, f.name) for f in fields(twin.material)}
     values |= {"rest_lengths": twin.topology.rest_lengths, "pushes": twin.topology.pushes}
     return {name: torch.tensor(value, dtype=dtype, device=device) for name, value in values.items()}
 
 
 def homogeneous(values: dict[str, float], springs: int) -> Material:
-    """A material that is the same everywhere; `values` has a number for every field of `Material` without a default."""
+    """A homogeneous material. `values` contains a number for every field of `Material` without a default."""
     every = {f.name: f for f in fields(Material) if f.name in values or (f.default is MISSING and f.default_factory is MISSING)}
     numbers: dict[str, Any] = {name: values[name] for name in every}
     arrays = {name: np.full(springs, values[name]) for name, f in every.items() if "shape" in f.metadata}

@@ -1,6 +1,7 @@
-"""The specification: a slow, readable float64 NumPy simulation, in the order of the released one. The Warp solver must agree.
+"""The specification: a slow, readable float64 NumPy simulation, in the order of the released code. The Warp solver must agree
+with it.
 
-Everything is written one equation a line, forward only; gradients are checked against its central differences.
+Each line is one equation. The simulation is forward only; tests compare gradients with its central differences.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from neuspring.physics.motion import APPROACH, MIN_TANGENT
 
 @dataclass(frozen=True)
 class ReferenceTwin:
-    """The numbers of a twin in float64, without the rounding of the stored float32 arrays unless they come from there."""
+    """The values of a twin in float64. `of` converts the stored float32 arrays; other values are not rounded to float32."""
 
     nodes: int
     springs: np.ndarray
@@ -31,11 +32,11 @@ class ReferenceTwin:
     contact_distance: float
     simulation: Simulation
     mass: np.ndarray | float = 1.0
-    """Mass of each node [N], or of all, kg."""
+    """Mass of each node [N], or of every node, kg."""
 
     @classmethod
     def of(cls, twin: Twin) -> ReferenceTwin:
-        """A twin's numbers."""
+        """Convert a twin."""
         t, m = twin.topology, twin.material
         return cls(
             nodes=len(t.nodes),
@@ -53,7 +54,7 @@ class ReferenceTwin:
 
 
 def rollout(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, controllers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States at frame ends, x and v, each [F, N, 3]; frame 0 is the given state. controllers [F, C, 3]."""
+    """States x and v at the ends of F frames, each [F, N, 3]. Frame 0 is the given state; controllers [F, C, 3]."""
     xs, vs = [np.asarray(x, np.float64)], [np.asarray(v, np.float64)]
     for begin, end in pairwise(controllers.astype(np.float64)):
         x, v = frame(scene, xs[-1], vs[-1], begin, end)
@@ -63,7 +64,7 @@ def rollout(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, controllers: np.
 
 
 def frame(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One frame: `substeps` substeps with controllers moving in a line from begin to end [C, 3]."""
+    """Simulate a frame of `substeps` substeps. Controllers move on a line from begin to end [C, 3]."""
     sim = scene.simulation
     spread = incidence(scene)
     hands_velocity = (end - begin) / sim.frame_time if sim.controller_velocity else np.zeros_like(begin)
@@ -75,7 +76,7 @@ def frame(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray, begin: np.ndarray,
 
 
 def incidence(scene: ReferenceTwin) -> csr_matrix:
-    """[N, S]: +1 where a node is the first end of a spring, -1 where it is the second; controllers are left out."""
+    """Incidence matrix [N, S]: +1 if a node is the first end of a spring, -1 if it is the second; without controllers."""
     count = len(scene.springs)
     total = int(max(scene.nodes, scene.springs.max(initial=0) + 1))
     values = np.concatenate([np.ones(count), -np.ones(count)])
@@ -119,7 +120,7 @@ def spring_forces(scene: ReferenceTwin, x: np.ndarray, v: np.ndarray) -> np.ndar
 
 
 def response(normal_speed: np.ndarray, tangent_speed: np.ndarray, e: float, mu: float) -> np.ndarray:
-    """a = max(0, 1 - mu (1 + e) |u_n| / |u_t|), the factor left on the tangential velocity."""
+    """Factor of the tangential velocity: a = max(0, 1 - mu (1 + e) |u_n| / |u_t|)."""
     factor: np.ndarray = np.maximum(0.0, 1.0 - mu * (1.0 + e) * np.abs(normal_speed) / np.maximum(tangent_speed, MIN_TANGENT))
     return factor
 
@@ -132,7 +133,7 @@ def candidates(x: np.ndarray, distance: float) -> np.ndarray:
 
 
 def collide(x: np.ndarray, v: np.ndarray, mass: np.ndarray, pairs: np.ndarray, distance: float, e: float, mu: float) -> np.ndarray:
-    """Jacobi impulses: each node takes the mean over its partners that are near and approach."""
+    """Jacobi impulses: each node receives the mean impulse of its partners that are near and approach."""
     i, j = pairs[:, 0], pairs[:, 1]
     dx, u = x[j] - x[i], v[j] - v[i]
     length = np.linalg.norm(dx, axis=1)
@@ -152,7 +153,7 @@ def collide(x: np.ndarray, v: np.ndarray, mass: np.ndarray, pairs: np.ndarray, d
 
 
 def bounce(x: np.ndarray, v: np.ndarray, dt: float, up: float, e: float, mu: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ground plane z = 0: nodes that would pass it downwards are reflected at their time of impact."""
+    """Ground plane z = 0: nodes that would pass below it are reflected at their time of impact."""
     falling = ((x[:, 2] + v[:, 2] * dt) * up < 0) & (v[:, 2] * up < -APPROACH)
     a = response(v[:, 2], np.linalg.norm(v[:, :2], axis=1), e, mu)
     bounced = np.concatenate([a[:, None] * v[:, :2], -e * v[:, 2:]], axis=1)

@@ -1,12 +1,14 @@
-"""A frame of simulation as a differentiable function of torch tensors, of one twin or of several at once.
+"""A frame of simulation as a differentiable function of torch tensors, for one or several twins.
 
-`FrameSolver` is a frame forward and backward: a launch on a CPU, a captured graph on CUDA. Its memory is substeps x nodes x twins.
-`simulate_frame` is the same for autograd. Chained frames give gradients over any horizon: only the states between frames are kept,
-and a frame whose substeps are no longer in a solver's buffers is simulated again from its start before its backward pass. A
-`FrameWindow` has buffers for the last frames, as many as its memory takes.
+`FrameSolver` computes a frame forward and backward: a launch on a CPU, a captured graph on CUDA. Its memory is proportional to
+substeps x nodes x twins. `simulate_frame` is the function for autograd.
 
-Several twins may have nodes, controllers and springs of their own (union.py). The springs of a node are summed in the order of its
-partners, so that a twin moves, bit for bit, as in a solver of its own.
+Chained frames have gradients over any horizon. Only the states between frames are stored. A frame whose substeps are no longer in
+a solver's buffers is simulated again before its backward pass. A `FrameWindow` has buffers for as many frames as its memory
+allows.
+
+Several twins may differ in nodes, controllers and springs (union.py). The forces on a node are summed in the order of its
+partners, so a twin has the same motion, bit for bit, alone and in a union.
 """
 
 from __future__ import annotations
@@ -30,40 +32,40 @@ from neuspring.physics.parameters import PARAMETERS, Parameters, packed
 from neuspring.physics.union import Union
 
 FRAME_WINDOW_BYTES = 1 << 30
-"""Bytes that a `FrameWindow` may take."""
+"""Largest memory of a `FrameWindow`, bytes."""
 WORTH_NARROWING = 0.9
-"""Part of the largest number of substeps, below which the others' largest makes it worth while to go on in fewer lanes."""
+"""The slowest twins end their frames in a narrower solver if the other twins need less than this fraction of their substeps."""
 PER_TWIN = ("frame_time", "substeps", "initial_velocity")
-"""Fields that may differ between the simulations of one solver; it does not read the last."""
+"""Fields that may differ between the simulations of one solver, which does not read the last."""
 
 
 IN_COMMON = tuple(field.name for field in fields(Simulation) if field.name not in PER_TWIN)
 
 
 def physics_of(simulation: Simulation) -> tuple[Any, ...]:
-    """Values that must be the same for all twins of a solver."""
+    """Values that must be equal for all twins of a solver."""
     return tuple(getattr(simulation, name) for name in IN_COMMON)
 
 
 def _check(simulations: Sequence[Simulation]) -> None:
-    """One physics for all twins of a solver."""
+    """Raise InputError unless all twins of a solver have the same physics."""
     for name in IN_COMMON:
         if len(values := {getattr(simulation, name) for simulation in simulations}) != 1:
-            rule = "must be the same for all twins of a solver, of which there is at least one"
-            raise InputError(f"simulation.{name}", rule, sorted(values), "Make a solver for each.")
+            rule = "must be the same for all twins of a solver, which has at least one twin"
+            raise InputError(f"simulation.{name}", rule, sorted(values), "Create a solver for each value.")
 
 
 class FrameSolver:
-    """Simulates frames of one spring graph.
+    """Simulates frames of one or several spring graphs.
 
-    spring_pairs [S, 2] index nodes; i >= nodes means controller i - nodes. All tensors that go in and out have `dtype` and
-    live on `device`. Float32 is the working precision, float64 serves verification.
+    - spring_pairs: [S, 2], indices of nodes; i >= nodes means controller i - nodes
+    - simulation: one, or a sequence for B twins. Then every tensor has a leading axis [B]
+    - device, dtype: of all tensors. Float32 is the working precision, float64 is for verification
+    - threads: one thread per node, as on CUDA, or a single thread, as on a CPU (frame.py)
+    - tables, sizes: the table of springs and the number of nodes of each twin (`Union`). Then `spring_pairs` is a sequence
 
-    A sequence of simulations makes a solver of as many twins, which may differ in parameters and state, and in `PER_TWIN` of their
-    simulations (else InputError); then every tensor has a leading axis [B]. A twin's numbers are the same, bit for bit, alone and
-    in company. They may have `tables` of springs: `spring_pairs` are then several, and `sizes` the nodes of each twin (`Union`).
-
-    `threads` chooses how a frame is computed (frame.py): by a thread per node, as on CUDA, or by one thread, as on a CPU.
+    Twins may differ in parameters, in state, and in the fields `PER_TWIN` of their simulations. A twin's numbers are the same,
+    bit for bit, alone and in a batch. Raises InputError if other fields differ.
     """
 
     def __init__(
@@ -94,19 +96,20 @@ class FrameSolver:
         self._kernels, self._graphs = frame.kernels(self.buffers.real, self.buffers.width), Graphs(device)
         self.grips = ControllerSprings(each[0], nodes, device) if len(each) == 1 else None
         self._held: torch.Tensor | None = None
-        """Rest lengths of grips that began since the parameters were set [B, L] (controllers.py)."""
+        """Rest lengths of grasps that began after the parameters were set [B, L] (controllers.py)."""
         self._plain: torch.Tensor | None = None
         """Springs as they were set [B, S, 3]."""
         self._factor: torch.Tensor | None = None
-        """Factors on the springs in this frame [B, S, 3], where some controller does not hold."""
+        """Factors on the springs in this frame [B, S, 3], if some controller does not hold."""
         self._reach = 0.0
+        """Largest contact distance, m."""
         self.narrower: FrameSolver | None = None
-        """A solver of the first twins, in which they end their frames."""
+        """A solver in which the first twins end their frames."""
         self.frame_token = 0
-        """Number of frames simulated: tells whether the buffers still hold a given one."""
+        """Number of simulated frames, which identifies the frame in the buffers."""
 
     def holding(self, token: int) -> FrameSolver | None:
-        """The solver whose buffers hold the frame that ended with this `frame_token`; None if it is no longer held."""
+        """Return the solver whose buffers contain the frame that ended with this `frame_token`; None if no solver does."""
         return self if token == self.frame_token else None
 
     @property
@@ -132,25 +135,28 @@ class FrameSolver:
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """State (x [N, 3] m, v [N, 3] m/s) one frame later; controllers move from begin to end [C, 3] (`controllers.waypoints`)."""
+        """Simulate a frame from the state (x [N, 3] m, v [N, 3] m/s); return the state at its end.
+
+        Controllers move from begin to end [C, 3], m (`controllers.waypoints`).
+        """
         self.start(x, v)
         self.advance(begin, end)
         x, v = (self.buffers.get_vectors(name, self.last, self.nodes) for name in ("x", "v"))
         return self._one(x), self._one(v)
 
     def start(self, x: torch.Tensor, v: torch.Tensor) -> None:
-        """Put the state at the start of a frame into the buffers."""
+        """Copy the state at the start of a frame to the buffers."""
         for name, values in (("x", x), ("v", v)):
             self.buffers.set_vectors(name, self._stacked(values), slot=0)
 
     def advance(self, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Simulate a frame from the state in slot 0; it ends in slot `last`."""
+        """Simulate a frame from the state in slot 0 to the state in slot `last`."""
         self._prepare(self._stacked(begin), self._stacked(end))
         self._simulate()
         self.frame_token += 1
 
     def _prepare(self, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Take grips, and partners for self-collision, from the start of a frame."""
+        """Update grasps, and partners for self-collision, at the start of a frame."""
         self._lead(begin, end)
         if self.simulation.self_collision:
             collision.find_candidates(self.buffers, self._reach)
@@ -168,13 +174,13 @@ class FrameSolver:
             self._hand_over(self.narrower, back=True)
 
     def narrow(self, other: FrameSolver) -> None:
-        """Let the first twins end their frames in `other`, a solver of them, from where all others have ended theirs."""
+        """Let the first twins end their frames in the solver `other`, when all remaining twins have ended their frames."""
         self.narrower, until = other, self.buffers.counts[other.buffers.twins]
         self.buffers.set_span(self.buffers.first, until)
         other.buffers.set_span(until, other.buffers.substeps)
 
     def _hand_over(self, other: FrameSolver, *, back: bool = False) -> None:
-        """Copy the state of the other's twins there, or back."""
+        """Copy the state of the twins of `other` to it, or back."""
         count = other.buffers.twins
         for name in ("x", "v"):
             values = self.buffers.get_vectors(name, 0)
@@ -183,25 +189,25 @@ class FrameSolver:
             (self if back else other).buffers.set_vectors(name, values if back else values[:count], 0)
 
     def _lead(self, begin: torch.Tensor, end: torch.Tensor) -> None:
-        """Take where controllers are at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
+        """Set the controllers at the begin and the end of a frame: rows of `controllers.waypoints` [B, C, 3 or 4]."""
         if begin.shape[-1] == end.shape[-1] == 4:
             if self.grips is None:
-                rule = "those of several scenes at once must hold in all frames"
-                raise InputError("controllers", rule, "4 numbers per controller", "Make a solver for each.")
+                rule = "controllers of several scenes in one solver must hold in all frames"
+                raise InputError("controllers", rule, "4 numbers per controller", "Create a solver for each scene.")
             if bool(begins(begin).any()):
                 self._held = self.grips.taken(self._held, self.buffers.get_vectors("x", 0, self.nodes), begin)
             self._hold(begin[..., 3] * end[..., 3] > 0)
         elif {begin.shape[-1], end.shape[-1]} != {3}:
             rule = "3 numbers per controller are required, or 4 where some do not hold"
-            raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Make them with controllers.waypoints.")
+            raise InputError("controllers", rule, [begin.shape[-1], end.shape[-1]], "Create them with controllers.waypoints.")
         elif self._factor is not None:
             self._hold(None)
         for name, places in (("begin", begin), ("end", end)):
             self.buffers.set_vectors(name, places[..., :3])
 
     def _hold(self, holds: torch.Tensor | None) -> None:
-        """Let the springs of controllers act that hold [B, C], and not those of others; None: all act."""
-        assert self._plain is not None, "set_parameters comes first"
+        """Let only springs of controllers that hold act, `holds` [B, C]; None: all act."""
+        assert self._plain is not None, "call set_parameters first"
         assert self.grips is not None
         self._factor = None
         if holds is not None:
@@ -213,29 +219,29 @@ class FrameSolver:
         self.buffers.set_parameter("springs", own if self._factor is None else own * self._factor)
 
     def follow(self, other: FrameSolver) -> None:
-        """Take the state of another solver: none, since a frame is given it."""
+        """Copy the state that another solver keeps between frames; this solver keeps none, because `start` sets the state."""
 
     def go_on(self) -> None:
-        """Take the end of the last frame for the start of the next."""
+        """Use the end of the last frame as the start of the next frame."""
         if self.last:
             for name in ("x", "v"):
                 self.buffers.tensors[name][0].copy_(self.buffers.tensors[name][self.last])
 
     @property
     def last(self) -> int:
-        """The slot that holds the end of a frame."""
+        """The slot that contains the end of a frame."""
         return self.buffers.substeps % self.buffers.slots
 
     def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: Parameters
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """`forward` with these parameters."""
+        """Set the parameters and call `forward`."""
         self.set_parameters(parameters)
         return self.forward(x, v, begin, end)
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, Parameters]:
-        """Adjoints of the last forward frame: of x, of v, and of each parameter that is trained, by name."""
-        assert self._held is None, "gradients of a grip need its rest lengths among the parameters: simulate_frame"
+        """Return the adjoints of the last forward frame: of x, of v, and of each trained parameter, by name."""
+        assert self._held is None, "gradients of later grasps require their rest lengths in the parameters; see simulate_frame"
         b = self.buffers
         for name, tensor in b.tensors.items():
             if name.startswith("adj_"):
@@ -251,16 +257,16 @@ class FrameSolver:
 
     @property
     def overflows(self) -> list[int]:
-        """Collision candidates that did not fit the lists, summed over nodes and frames so far, of each twin."""
+        """Collision candidates of each twin that exceeded the lists, summed over nodes and frames so far."""
         return [int(count) for count in collision.overflow(self.buffers)]
 
     @property
     def collision_overflow(self) -> int:
-        """The same of all twins."""
+        """The sum of `overflows` over all twins."""
         return sum(self.overflows)
 
     def _stacked(self, values: torch.Tensor) -> torch.Tensor:
-        """The values of all twins with a leading axis [B]."""
+        """Add a leading axis [B] to the values of a single twin."""
         return values if self.together else values[None]
 
     def _one(self, values: torch.Tensor) -> torch.Tensor:
@@ -270,7 +276,7 @@ class FrameSolver:
         if self.buffers.threads:
             self._graphs.run(name, self._needed(name), launch)
             return
-        # One launch needs no graph. Warp would record it with whatever other threads of the process launch meanwhile.
+        # One launch needs no graph. A capture would also record the launches of other threads of the process.
         for kernel in self._needed(name):
             load(kernel, self.device)
         launch()
@@ -285,7 +291,7 @@ class FrameSolver:
         return iter([k.settle, k.pull, *([k.hit, k.slow] if self.simulation.self_collision else [])])
 
     def launch_forward(self) -> None:
-        """A frame (`frame.py`)."""
+        """Launch the kernels of a frame (`frame.py`)."""
         b, k = self.buffers, self._kernels
         model, state, _ = b.arguments
         if not b.threads:
@@ -298,7 +304,7 @@ class FrameSolver:
                 b.launch(k.collide, (b.nodes, b.groups), model, state, step)
 
     def launch_backward(self) -> None:
-        """The adjoint of a frame."""
+        """Launch the kernels of the adjoint of a frame."""
         b, k = self.buffers, self._kernels
         arguments, size = b.arguments, (b.nodes, b.groups)
         if not b.threads:
@@ -314,9 +320,10 @@ class FrameSolver:
 
 
 class FrameWindow:
-    """The last frames of a spring graph, as a solver of their own each, so that a gradient through them simulates none again.
+    """The last frames of a spring graph, each in its own solver, so that a gradient through them does not simulate a frame again.
 
-    `make` makes a solver of the graph; there will be `frames` of them, or as many as fit into `FRAME_WINDOW_BYTES`, one at least.
+    `make` creates a solver of the graph. There are up to `frames` solvers, as far as they fit into `FRAME_WINDOW_BYTES`, at least
+    one.
     """
 
     def __init__(self, make: Callable[[], FrameSolver], frames: int) -> None:
@@ -325,7 +332,7 @@ class FrameWindow:
         self.frame_token = 0
 
     def turn(self) -> FrameSolver:
-        """The solver that takes the next frame: that of the oldest."""
+        """Return the solver for the next frame: a new one, or that of the oldest frame."""
         place = self.frame_token % self._room
         if place == len(self._solvers):
             self._solvers.append(self._make())
@@ -333,30 +340,30 @@ class FrameWindow:
         return self._solvers[place]
 
     def run(self, *inputs: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `FrameSolver.run`."""
+        """Simulate a frame; see `FrameSolver.run`."""
         return self.turn().run(*inputs)
 
     def holding(self, token: int) -> FrameSolver | None:
-        """As `FrameSolver.holding`."""
+        """Return the solver that contains a frame; see `FrameSolver.holding`."""
         held = max(0, self.frame_token - self._room) < token <= self.frame_token
         return self._solvers[(token - 1) % self._room] if held else None
 
     @property
     def overflows(self) -> list[int]:
-        """As `FrameSolver.overflows`."""
+        """The sum of `FrameSolver.overflows` over all solvers, of each twin."""
         return [sum(counts) for counts in zip(*(solver.overflows for solver in self._solvers), strict=True)]
 
 
 class AdjointLimit:
-    """Limit of one backward pass through chained frames: leaves out frames whose adjoints outgrow the losses, and counts them.
+    """Limit of a backward pass through chained frames: omits frames whose adjoints outgrow the losses, and counts them.
 
-    The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the frame's time, s. A frame is left out if that at its
-    begin is more than `factor` times the sum of |dL/dx| that the losses behind it have added. What lies before it then has the
-    gradient of its own losses.
+    The size of an adjoint is sqrt(|dL/dx|^2 + |dL/dv|^2 / T^2), where T is the duration of a frame, s. A frame is omitted if the
+    size at its begin exceeds `factor` times the sum of |dL/dx| from the losses of this and later frames. Earlier frames then have
+    only the gradients of their own losses.
 
-    A body that rests on the ground bounces on it by micrometers. Each reflection turns a disturbance of one node around and not
-    that of its neighbors, and springs answer to the difference: a disturbance grows a millionfold in a frame, though the motion is
-    smooth. Such a gradient says nothing about parameters, and Adam hardly moves for hundreds of steps after it.
+    An object at rest on the ground bounces by micrometers. A reflection reverses the disturbance of a node, but not that of its
+    neighbors, and springs amplify the difference. So a disturbance can grow a millionfold in a frame, although the motion is
+    smooth. Such a gradient contains no information about the parameters, and it blocks Adam for hundreds of steps.
     """
 
     def __init__(self, factor: float, frame_time: float) -> None:
@@ -364,10 +371,13 @@ class AdjointLimit:
         self.left_out = 0
         self._added = 0.0
         self._carried: torch.Tensor | None = None
-        """dL/dx at the begin of the frame that came last."""
+        """dL/dx at the begin of the frame of the last call."""
 
     def passes(self, after: Sequence[torch.Tensor], before: Sequence[torch.Tensor]) -> bool:
-        """True for a frame that stays, from (dL/dx, dL/dv) at its end, `after`, and begin, `before`; frames come last first."""
+        """Return True if a frame is not omitted, from (dL/dx, dL/dv) at its end, `after`, and begin, `before`.
+
+        Call it for the frames in reverse order.
+        """
         (end, _), (x, v) = after, before
         self._added += _norm(end if self._carried is None else end - self._carried)
         stays = math.hypot(_norm(x), _norm(v) / self.frame_time) <= self.factor * self._added
@@ -381,18 +391,21 @@ def _norm(values: torch.Tensor) -> float:
 
 
 class Frame(torch.autograd.Function):
-    """A frame of any solver that has the three members used here.
+    """A frame of any solver with these three members:
 
-    `run(begin, end, x, v, parameters)` simulates a frame and returns (x, v); `frame_token` counts the frames. `holding(token)` has
-    that frame still, or is None: its `backward(adj_x, adj_v)` returns the adjoints of x and v, and those of parameters by name. A
-    frame that does not pass its limit has no gradient.
+    - `run(begin, end, x, v, parameters)` simulates a frame and returns (x, v)
+    - `frame_token` counts the frames
+    - `holding(token)` returns an object that still contains the frame, or None. Its `backward(adj_x, adj_v)` returns the adjoints
+      of x and v, and those of the parameters by name
+
+    A frame that does not pass its limit has no gradient.
     """
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, solver: Any, limit: AdjointLimit | None, names: Sequence[str], *inputs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(x, v) after the frame, from begin, end, x, v, and the parameters of these names."""
+        """Return (x, v) after the frame. `inputs` are begin, end, x, v, and the parameters in the order of `names`."""
         ctx.solver, ctx.limit, ctx.names = solver, limit, names
         state = Frame._run(ctx, inputs)
         ctx.token = solver.frame_token
@@ -401,7 +414,7 @@ class Frame(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
-        """Adjoints of the inputs; none of the controllers' path."""
+        """Return the adjoints of the inputs; the path of the controllers has none."""
         held = ctx.solver.holding(ctx.token)
         if held is None:
             Frame._run(ctx, ctx.saved_tensors)
@@ -426,10 +439,10 @@ def simulate_frame(
     end: torch.Tensor,
     limit: AdjointLimit | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(x, v) one frame later, differentiable in x, v and parameters. Shapes as in `FrameSolver.forward`, solvers as in `Frame`.
+    """Simulate a frame, differentiably in x, v and parameters; return (x, v) at its end.
 
-    Rest lengths are those of the parameters: where grips begin later than frame 0, put theirs there first (`controllers.Grips`).
-    Without a limit the gradient is exact.
+    Shapes are those of `FrameSolver.forward`; `Frame` lists the requirements on solvers. For grasps that begin after frame 0,
+    first apply their rest lengths to the parameters (`controllers.ControllerSprings`). Without a limit, the gradient is exact.
     """
     inputs = begun(begin), end, x, v, *parameters.values()
     state: tuple[torch.Tensor, torch.Tensor] = Frame.apply(solver, limit, tuple(parameters), *inputs)  # type: ignore[no-untyped-call]
@@ -443,7 +456,7 @@ def solver_for(
     *,
     differentiable: bool = True,
 ) -> FrameSolver:
-    """A solver with parameters set: of a lattice, or of several: tensors have an axis [B]."""
+    """Create a solver of one lattice or several and set its parameters. Tensors of several twins have a leading axis [B]."""
     options: dict[str, Any] = {"device": device, "dtype": dtype, "differentiable": differentiable}
     if isinstance(twins, Twin):
         first = twins.topology
@@ -457,17 +470,17 @@ def solver_for(
 
 
 def solver_of(union: Union, simulations: Sequence[Simulation], **options: Any) -> FrameSolver:
-    """A solver of twins side by side, with options of `FrameSolver`; without parameters."""
+    """Create a solver of a union of twins, with options of `FrameSolver`. Its parameters are not set."""
     pairs = union.tables[0] if len(union.tables) == 1 else union.tables
     options |= {"tables": union.table, "sizes": [nodes for nodes, _ in union.sizes]}
     return FrameSolver(pairs, union.nodes, union.controllers, simulations, **options)
 
 
 def narrowing_solver(twins: Sequence[Twin], device: str) -> FrameSolver:
-    """A solver without gradients of several twins; on a CPU the first, if they come slowest first, end frames out of lanes.
+    """Create a solver of several twins without gradients. On a CPU, the slowest twins end their frames outside of the lanes.
 
-    Lanes cost the same whoever still moves in them, and few candidates of a search need several times the substeps of the others.
-    Twins of several scenes do not narrow.
+    Twins must be sorted, slowest first. The cost of lanes does not depend on how many twins still move, and a few candidates of a
+    search need several times the substeps of the others. Twins of several scenes stay in the lanes.
     """
     simulations = [twin.simulation for twin in twins]
     union, counts = Union([twin.topology for twin in twins]), [simulation.substeps for simulation in simulations]

@@ -4,11 +4,15 @@ With d = (x_j - x_i) / l, l = |x_j - x_i|, strain s = l / l0 - 1 and closing spe
 
     f_e = (Y s + gamma w) d        to node i, and -f_e to node j.
 
-A controller's spring that only pushes has no force while it is longer than at rest. The sign of its 1 / l0 is negative.
+A controller spring that only pushes has no force while it is longer than at rest. Its 1 / l0 is stored as a negative number.
 
-`allocate` lists the springs twice: as rows, each spring once at its lower end, for one thread that goes through all nodes in turn;
-and as links, each spring at both ends, for a thread per node that shares nothing with others. A node's sum goes through its
-partners in ascending order both ways, so both give the same numbers. Twins of other scenes have tables of springs of their own.
+`allocate` lists the springs twice:
+
+- rows: each spring once, at its lower end, for a single thread
+- links: each spring at both ends, for one thread per node, without shared writes
+
+Both sum the forces of a node over its partners in ascending order, so both have the same numbers. Each scene has its own table of
+springs.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -25,25 +29,25 @@ from neuspring.physics.lanes import lanes
 
 
 def allocate(b: Buffers, tables: Sequence[np.ndarray]) -> None:
-    """Tables of springs [S, 2] between points, each for some groups of twins; i >= nodes means controller i - nodes.
+    """Allocate tables of springs [S, 2] between points, one per scene; i >= nodes means controller i - nodes.
 
-    Springs are ordered by lower end, then by upper end; where there are several tables, the caller's must be.
+    Springs are sorted by lower end, then by upper end. Several tables must already be sorted.
     """
     rows, links = [_rows(b.nodes, pairs) for pairs in tables], [_links(b.nodes, pairs) for pairs in tables]
     starts, link_starts = (np.cumsum([0, *(len(one[-1]) for one in each)])[:-1] for each in (rows, links))
     most = max(len(order) for order, _, _ in rows)
     order = rows[0][0] if len(tables) == 1 else np.arange(most)
     b.add_integers(
-        order=order,  # Where each spring stands in the caller's list [S].
-        ranks=np.argsort(order),  # Where each spring of the caller's list stands here [S].
-        # First spring of each node's row [N + 1], and upper end of each spring, of all tables one after the other.
+        order=order,  # Index of each spring in the caller's list [S].
+        ranks=np.argsort(order),  # Index here of each spring of the caller's list [S].
+        # First spring of each node's row [N + 1], and upper end of each spring; tables are concatenated.
         rows=np.concatenate([first + start for (_, first, _), start in zip(rows, starts, strict=True)]),
         partners=np.concatenate([*(upper for _, _, upper in rows), np.zeros(BEHIND)]),
-        # The same for links: the first of each node, their other ends, ascending within a node, and their springs in the table.
+        # First link of each node; other end of each link, ascending within a node; spring of each link in its table.
         links=np.concatenate([first + start for (first, _, _), start in zip(links, link_starts, strict=True)]),
         link_partners=np.concatenate([other for _, other, _ in links]),
         link_springs=np.concatenate([spring for _, _, spring in links]),
-        # Of each group: where its table begins among rows and links, and among springs.
+        # For each group: offsets of its table in rows and links, and in springs.
         first_row=np.array(b.table_of_group) * (b.nodes + 1),
         first_spring=starts[b.table_of_group],
     )
@@ -56,13 +60,13 @@ def _sorted(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rows(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Order of a table's springs, first of each row [N + 1], upper ends [S]."""
+    """Order of the springs of a table, first spring of each row [N + 1], upper ends [S]."""
     order, ends = _sorted(pairs)
     return order, np.searchsorted(ends[:, 0], np.arange(nodes + 1)), ends[:, 1]
 
 
 def _links(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First link of each node [N + 1], other ends, springs."""
+    """First link of each node [N + 1], other end and spring of each link."""
     order, ends = _sorted(pairs)
     first, other, spring = ends.T.reshape(-1), ends[:, ::-1].T.reshape(-1), np.tile(np.arange(len(order)), 2)
     linked = np.lexsort((other, first))
@@ -74,7 +78,7 @@ def _links(nodes: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
     """(add_row, its adjoint, gathered, its adjoint) for a scalar type, wp.float32 or wp.float64, and a number of lanes.
 
-    `pushes`: some springs only push. To look at that in every spring costs a fifth of the time in lanes.
+    `pushes`: some springs only push. The check costs a fifth of the time in lanes.
     """
     lane = lanes(real, width)
     Number, Vector = lane.Number, lane.Vector
@@ -86,12 +90,12 @@ def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def acts(strain: Number, p: Vector) -> Number:
-        """0 for a spring that only pushes and is longer than at rest, 1 for others."""
+        """Return 0 for a spring that only pushes and is longer than at rest, otherwise 1."""
         return wp.cw_mul(half, one + wp.sign(-wp.min(strain, -p[1])))
 
     @wp.func
     def pull(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector) -> Vector:
-        """The force of spring e on an end at x with velocity v, from its other end j."""
+        """Return the force of spring e on its end at x with velocity v; j is the other end."""
         offset = state.x[slot, j, g] - x
         relative = state.v[slot, j, g] - v
         p = model.springs[e, g]  # Rows: Y, 1 / l0, gamma.
@@ -105,11 +109,11 @@ def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def pull_adjoint(model: Model, state: State, slot: int, e: int, j: int, g: int, x: Vector, v: Vector, adj_force: Vector):
-        """Adjoints of offset, of relative velocity, of the parameters (second row over Y)."""
+        """Return the adjoints of offset, relative velocity and parameters (second row divided by Y)."""
         offset = state.x[slot, j, g] - x
         relative = state.v[slot, j, g] - v
         p = model.springs[e, g]
-        # With d = offset / l written out, so that d itself is never formed.
+        # d = offset / l is substituted, so that d is not computed.
         length = root(dot(offset, offset))
         inverse = wp.cw_div(one, floored(length))
         shorter = wp.abs(p[1])
@@ -119,8 +123,8 @@ def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
             c = scaled(c, acts(strain, p))
         cd = wp.cw_mul(dot(c, offset), inverse)
         wd = wp.cw_mul(dot(relative, offset), inverse)
-        # d(f.c)/d(offset): the direction turns (c and the relative velocity, without their parts along d), the length
-        # stretches the spring (along d).
+        # d(f.c)/d(offset): a rotation of d acts on the components of c and relative velocity normal to d; a change of length
+        # acts along d.
         turn = wp.cw_mul(wp.cw_mul(p[0], strain) + wp.cw_mul(p[2], wd), inverse)
         drift = wp.cw_mul(wp.cw_mul(cd, p[2]), inverse)
         along = wp.cw_mul(cd, wp.cw_mul(p[0], shorter) - turn) - wp.cw_mul(wd, drift)
@@ -168,7 +172,7 @@ def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def gathered(model: Model, state: State, slot: int, i: int, g: int) -> Vector:
-        """The sum of the forces on node i."""
+        """Return the sum of the forces on node i."""
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         total = Vector()
@@ -182,7 +186,7 @@ def functions(real: Any, width: int, pushes: bool) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def gathered_adjoint(model: Model, state: State, adjoint: Adjoint, slot: int, turn: int, i: int, g: int):
-        """Adjoint of `gathered`: dL/d(force) of node i and its partners -> dL/d(x, v) of node i, dL/d(parameters) at lower ends."""
+        """Adjoint of `gathered`: dL/d(force) of node i and partners -> dL/d(x, v) of node i, dL/d(parameters) at lower ends."""
         x = state.x[slot, i, g]
         v = state.v[slot, i, g]
         adj_force = adjoint.force[turn, i, g]

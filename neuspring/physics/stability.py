@@ -1,12 +1,16 @@
-"""Is the substep small enough? A bound for symplectic Euler with dashpots, per node and as a spectrum.
+"""The stability bound of symplectic Euler with dashpots, from the spectrum of a twin.
 
 For unit masses and a mode with stiffness eigenvalue lambda and damping eigenvalue c, the update is stable if
-dt^2 lambda + 2 dt c < 4 (Jury's criterion on z^2 - (2 - c dt - lambda dt^2) z + 1 - c dt). Since lambda and c are Rayleigh
-quotients of the same vector, it suffices that the largest eigenvalue of M(dt) = dt^2 K + 2 dt C is below 4, with
-K = sum_e (Y / l0) d d^T and C = sum_e gamma d d^T over the springs' direction blocks. Drag only helps and is ignored.
-With other masses M, M^-1/2 K M^-1/2 and M^-1/2 C M^-1/2 stand for K and C: a spring's row over the root of each end's mass.
 
-Eigenvalues are those of the rest configuration (Lanczos). Deformation turns directions but hardly raises them: `safety` covers it.
+    dt^2 lambda + 2 dt c < 4
+
+(Jury's criterion on z^2 - (2 - c dt - lambda dt^2) z + 1 - c dt). lambda and c are Rayleigh quotients of the same vector. So it
+is sufficient that the largest eigenvalue of M(dt) = dt^2 K + 2 dt C is below 4, with K = sum_e (Y / l0) d d^T and C = sum_e gamma
+d d^T over the springs' direction blocks. Other masses M replace K and C by M^-1/2 K M^-1/2 and M^-1/2 C M^-1/2. Drag increases
+stability and is ignored.
+
+Eigenvalues are those of the rest configuration (Lanczos). Deformation rotates the directions but hardly raises the eigenvalues;
+`safety` covers the difference.
 """
 
 from __future__ import annotations
@@ -20,18 +24,18 @@ from neuspring.core.errors import InputError
 
 STABILITY_LIMIT = 4.0
 PREDICTION = 0.4
-"""Fraction of the bound for predictions. A substep multiplies a damped mode by 1 - dt c; with dt c <= 0.8 it keeps its sign."""
+"""Fraction of the bound for predictions. A substep multiplies a damped mode by 1 - dt c; dt c <= 0.8 keeps its sign."""
 MAX_SUBSTEPS = 2000
-"""Upper limit of `simulation.substeps: auto`, per frame: beyond it a twin takes seconds per frame."""
+"""Largest number of substeps per frame with `simulation.substeps: auto`. With more, a twin takes seconds per frame."""
 RELEASED_SUBSTEPS = 667
 RELEASED_FRAME_TIME = RELEASED_SUBSTEPS * 5e-5
-"""s, whatever the frame rate (released_quirks.frame_time_667)."""
+"""Duration of a frame with `released_quirks.frame_time_667`, s, whatever the frame rate."""
 TOLERANCE = 1e-3
-"""Relative residual of the eigenvalues of a spectrum."""
+"""Largest relative residual of the eigenvalues."""
 
 
 class Unstable(InputError):
-    """The substep is beyond the stability bound."""
+    """The substep exceeds the stability bound."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,11 @@ class Spectrum:
     node: int
 
     def load(self, substep: float) -> float:
-        """dt^2 lambda + 2 dt c: stable below 4. An upper bound, since both maxima need not share a mode."""
+        """Return dt^2 lambda + 2 dt c; stable below 4. It is an upper bound, because the maxima may be of different modes."""
         return substep**2 * self.stiffness + 2 * substep * self.damping
 
     def largest_substep(self, safety: float) -> float:
-        """The largest dt [s] with load(dt) <= 4 * safety."""
+        """Return the largest dt, s, with load(dt) <= 4 * safety."""
         a, b = self.stiffness, 2 * self.damping
         if a <= 0:
             return np.inf if b <= 0 else STABILITY_LIMIT * safety / b
@@ -57,7 +61,12 @@ class Spectrum:
 def rest_spectrum(
     springs: np.ndarray, nodes: np.ndarray, controllers: np.ndarray, stiffness: np.ndarray, damping: np.ndarray, mass: np.ndarray
 ) -> Spectrum:
-    """Largest eigenvalues in the rest configuration. stiffness is Y / l0 [S], damping gamma [S], mass [N], kg, or empty: 1 each."""
+    """Compute the largest eigenvalues in the rest configuration.
+
+    - stiffness: Y / l0 [S], N/m
+    - damping: gamma [S], N s/m
+    - mass: [N], kg; empty: 1 kg each
+    """
     from neuspring.physics import lanczos
 
     ends = np.concatenate([nodes, controllers]).astype(np.float64)[springs.reshape(-1, 2)]
@@ -76,31 +85,31 @@ def twin_spectrum(twin: Twin) -> Spectrum:
 
 
 def smallest_safe_substeps(spectrum: Spectrum, frame_time: float, safety: float) -> int:
-    """The smallest number of substeps per frame whose load is below 4 * safety."""
+    """The smallest number of substeps per frame with a load below 4 * safety."""
     return int(frame_time / spectrum.largest_substep(safety)) + 1
 
 
 def needed_substeps(twin: Twin, safety: float) -> int:
-    """The same for a twin at rest."""
+    """`smallest_safe_substeps` of a twin at rest."""
     return smallest_safe_substeps(twin_spectrum(twin), twin.simulation.frame_time, safety)
 
 
 def with_substeps(twin: Twin, count: int) -> Twin:
-    """The twin with so many substeps per frame."""
+    """Return the twin with `count` substeps per frame."""
     return replace(twin, simulation=replace(twin.simulation, substeps=count))
 
 
 def stable(twin: Twin, safety: float) -> Twin:
-    """The twin with at least as many substeps as a part `safety` of the stability bound asks for."""
+    """Return the twin with at least the substeps that the fraction `safety` of the stability bound requires."""
     return with_substeps(twin, max(needed_substeps(twin, safety), twin.simulation.substeps))
 
 
 def for_prediction(twin: Twin) -> Twin:
-    """A lattice as predictions are made with it: where the body can meet itself, with substeps for `PREDICTION`.
+    """Return the lattice for predictions: with self-collision, it has the substeps that `PREDICTION` requires.
 
-    Above half of the bound a damped mode turns around in every substep, and a contact that meets it on its way back kicks it again:
-    springs of a cloth that lay on itself were stretched to four times their length. Other twins stay as they are, and so does one
-    with the released frame time, which stands for the released simulator.
+    Above half of the bound, a damped mode changes sign in every substep, and contacts can amplify it. In a folded cloth this
+    stretched springs to four times their length. Twins without self-collision do not change. Neither do twins with the released
+    frame time, which represent the released simulator.
     """
     simulation = twin.simulation
     if not simulation.self_collision or simulation.frame_time == RELEASED_FRAME_TIME:
@@ -109,7 +118,7 @@ def for_prediction(twin: Twin) -> Twin:
 
 
 def check(twin: Twin) -> None:
-    """Raise Unstable, naming node, bound and remedy, if the twin's substep is beyond the stability limit."""
+    """Raise Unstable, with node, bound and remedy, if the twin's substep exceeds the stability bound."""
     simulation, spectrum = twin.simulation, twin_spectrum(twin)
     if spectrum.load(simulation.substep) >= STABILITY_LIMIT:
         largest = spectrum.largest_substep(1.0)

@@ -1,10 +1,10 @@
-"""From points to a spring graph (as the released PhysTwin code makes it), uniform or piecewise (the paper's piecewise topology).
+"""The spring graph of points, as in the released PhysTwin code: uniform, or piecewise (the paper's piecewise topology).
 
-Every object node asks for its nearest nodes within a radius; every controller asks for its nearest object nodes. A spring is made
-if either end asks for it. In a piecewise topology each region of nodes has
-its own radius and number of neighbors; a node asks among all nodes, with its own region's values, so regions stay joined.
-A body is one piece: what no spring joins to the rest, a node or a part behind a gap in what was seen, is joined along its seam.
-Radii of a search are in units of the spacing of the nodes.
+Every object node selects its nearest nodes within a radius, and every controller its nearest object nodes. Two points share a
+spring if at least one of them selects the other. In a piecewise topology, each region of nodes has its own radius and number of
+neighbors. Nodes select among all nodes, with the values of their own region, so regions stay connected. The repair connects nodes
+and parts without a spring to the rest, for example behind a gap in the observations. Radii of a search are in units of the node
+spacing.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from neuspring.core.artifacts import NO_REST_SHAPE, Topology, canonical_shape
 from neuspring.core.errors import InputError
 
 TREE_NEIGHBORS = 16
-"""Nearest nodes among which the tree is looked for: more than a ring or a voxel's corner has."""
+"""Number of nearest nodes in the graph of the spanning tree: more than the neighbors in a ring or at the corner of a voxel."""
 TREE_QUANTILE = 0.9
-"""Quantile of the tree's edges that is the spacing."""
+"""Quantile of the edge lengths of the tree that is the spacing."""
 
 
 def nearest(nodes: np.ndarray, points: np.ndarray, count: int, reach: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Distances, m, and indices [P, k] of the `count` nearest nodes of points [P, 3], or all; infinite from `reach` on."""
+    """Distances, m, and indices [P, k] of the `count` nearest nodes (at most all) of points [P, 3]; infinite from `reach` on."""
     from scipy.spatial import cKDTree
 
     distance, index = cKDTree(nodes).query(points, k=np.arange(1, min(count, len(nodes)) + 1), distance_upper_bound=reach)
@@ -32,13 +32,13 @@ def nearest(nodes: np.ndarray, points: np.ndarray, count: int, reach: float = np
 
 
 def node_spacing(nodes: np.ndarray) -> float:
-    """Distance between neighboring nodes of a body [N, 3], m: the 0.9 quantile of the edges of its minimum spanning tree.
+    """Distance between neighboring nodes [N, 3], m: the 0.9 quantile of the edge lengths of their minimum spanning tree.
 
-    The tree joins all nodes by the shortest edges that do. Its longest edges lead across gaps: from ring to ring of a body whose
-    nodes are nearer to each other within a ring, and from voxel to voxel where a body was sampled on voxels. So a radius of one
-    spacing joins the body. The median distance of nearest neighbors does not: nodes of a voxel grid come in close pairs, those of a
-    ring are near each other. The last tenth of the edges is left out because of holes in what was seen.
-    Scales with the nodes and does not depend on their order. Raises InputError if no two nodes lie apart.
+    The longest edges of the tree cross gaps, for example between rings or voxels, so a radius of one spacing connects the object.
+    The median distance of nearest neighbors does not: nodes of a voxel grid form close pairs, and nodes of a ring are close
+    together. The quantile excludes the longest edges, because they may cross holes in the observations.
+
+    The spacing scales with the nodes and does not depend on their order. Raises InputError if all nodes coincide.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -46,40 +46,40 @@ def node_spacing(nodes: np.ndarray) -> float:
     points = np.asarray(nodes, np.float64)
     distance, partner = nearest(points, points, TREE_NEIGHBORS + 1)
     first = np.repeat(np.arange(len(points)), distance.shape[1])
-    # Where all neighbors are nearer than the next part of the body, the tree is a forest: the few edges between are not missed.
+    # If parts are farther apart than all neighbors, the tree is a forest. The few missing edges hardly change the quantile.
     near = coo_array((distance.ravel(), (first, partner.ravel())), shape=(len(points), len(points)))
     edges = minimum_spanning_tree(near.tocsr()).data
     edges = edges[edges > 0]
     if not len(edges):
-        raise InputError("observations", "at least two nodes at different places are required", f"{len(points)} nodes")
+        raise InputError("observations", "at least two nodes at different positions are required", f"{len(points)} nodes")
     return float(np.quantile(edges, TREE_QUANTILE))
 
 
 def controller_reach(nodes: np.ndarray, controllers: np.ndarray) -> float:
-    """Smallest distance between a controller [C, 3] and a node [N, 3], m: a smaller radius holds nothing.
+    """Smallest distance between a controller [C, 3] and a node [N, 3], m. A smaller radius creates no controller spring.
 
-    Of a filmed hand most points are on fingers and forearm, far from what it holds, so the mean distance says nothing.
+    The mean distance is not suitable: most controllers of a recorded hand are on fingers and forearm, far from the object.
     """
     return float(nearest(np.asarray(nodes, np.float64), np.asarray(controllers, np.float64), 1)[0].min())
 
 
 MIN_LENGTH = 1e-4
-"""Shorter object springs are not made, m."""
+"""Smallest length of an object spring, m."""
 REPAIR_SPRINGS = 3
-"""Springs given to a node of a seam: the fewest that can hold a point in space."""
+"""Number of springs that the repair adds to a node: the smallest number that can hold a point in space."""
 
 
 REGION_STEP = 1 / 128
-"""Node spacings to which places of nodes are rounded where regions are made: more than float32 loses, less than matters. Places on
-half a step would be rounded by chance; those of lattices lie on simple fractions of a spacing."""
+"""Step to which positions are rounded before clustering, in node spacings: coarser than float32 rounding, too fine to matter.
+Nodes of regular lattices are at simple fractions of a spacing, so they are not at half a step."""
 
 
 def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     """Region of each node [N], 0 .. count - 1, by agglomerative clustering (Ward) of nodes [N, 3], m.
 
-    Regions are numbered by their centroids (x, then y, then z). Neither unit nor order of the nodes matters, on lattices too, where
-    nearly all merges are ties: nodes are clustered by whole steps of `REGION_STEP`, in the order of their places.
-    Raises InputError if there are fewer nodes than regions.
+    Regions are numbered by their centroids (x, then y, then z). Nodes are rounded to `REGION_STEP` and sorted by position. So
+    neither unit nor order of the nodes matters, even on regular lattices, where nearly all merges are ties. Raises InputError if
+    there are fewer nodes than regions.
     """
     if count < 1:
         raise InputError("clusters", "at least one region is required", count, "Choose 1 or more.")
@@ -88,7 +88,7 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     if len(nodes) < count:
         rule = f"{count} regions need at least {count} nodes"
         raise InputError("clusters", rule, f"{len(nodes)} nodes", "Choose fewer regions.")
-    # Imported here: it takes longer than most commands that need a topology.
+    # Imported here, because the import takes longer than most commands that need a topology.
     from sklearn.cluster import AgglomerativeClustering
 
     points = np.asarray(nodes, np.float64)
@@ -96,7 +96,7 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
     order = np.lexsort(places.T[::-1])
     clusters = np.empty(len(places), np.int64)
     clusters[order] = AgglomerativeClustering(n_clusters=count, linkage="ward").fit_predict(places[order])
-    # Far below any distance between regions, far above rounding, so ties between equal coordinates are seen as ties.
+    # Rounding far below the distances between regions keeps ties between equal coordinates.
     centroids = np.round([places[clusters == label].mean(axis=0) for label in range(count)], 6)
     number = np.empty(count, np.int32)
     number[np.lexsort(centroids.T[::-1])] = np.arange(count)
@@ -104,11 +104,10 @@ def regions(nodes: np.ndarray, count: int) -> np.ndarray:
 
 
 def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
-    """The springs [S, 2] between nodes [N, 3], m, followed by those that make the body one piece.
+    """The springs [S, 2] between nodes [N, 3], m, followed by springs that connect all pieces.
 
-    Each piece asks for springs, but the one that is larger than all others: its nodes from which the rest is at most a node spacing
-    farther than from the nearest of them, each from its 3 nearest nodes of the rest. So a single node has 3 springs, and a part
-    behind a gap a seam.
+    Every piece except the largest selects springs to the rest. Its nodes along the gap, whose distance to the rest is at most one
+    node spacing above the smallest, each select their 3 nearest nodes of the rest. So a single node gets 3 springs.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -124,7 +123,7 @@ def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
         largest = np.flatnonzero(sizes == sizes.max())
         for label in np.setdiff1d(np.arange(pieces), largest if len(largest) == 1 else []):
             own, rest = np.flatnonzero(piece == label), np.flatnonzero(piece != label)
-            # Nodes at the same place are no partners.
+            # Coincident nodes are no partners.
             same = max(cKDTree(nodes[rest]).query_ball_point(nodes[own], MIN_LENGTH, return_length=True))
             distance, partner = nearest(nodes[rest], nodes[own], REPAIR_SPRINGS + same)
             usable = distance > MIN_LENGTH
@@ -137,13 +136,13 @@ def joined(nodes: np.ndarray, springs: np.ndarray) -> np.ndarray:
 
 
 def object_springs(nodes: np.ndarray, radius: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Springs between object nodes, [S, 2], in the order in which they are first asked for.
+    """Springs between object nodes [S, 2], in the order of their first selection.
 
-    Node i asks for its `neighbors[i]` nearest nodes, itself included, at a distance below `radius[i]` [m].
+    Node i selects its `neighbors[i]` nearest nodes, itself included, at distances below `radius[i]`, m.
     """
     distance, partner = nearest(nodes, nodes, int(neighbors.max()), float(radius.max()))
     rank = np.arange(distance.shape[1])
-    # The first hit is the node itself (or an exact duplicate, which the length rule would refuse anyway).
+    # Rank 0 is the node itself, or an exact duplicate, which MIN_LENGTH excludes anyway.
     wanted = (rank > 0) & (rank < neighbors[:, None]) & (distance < radius[:, None]) & (distance > MIN_LENGTH)
     first, column = np.nonzero(wanted)
     return _first_of_each(np.stack([first, partner[first, column]], axis=1), len(nodes))
@@ -164,7 +163,7 @@ def controller_springs(nodes: np.ndarray, controllers: np.ndarray, radius: float
 
 
 def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
-    """Distance of the ends of each spring [S], m, in double precision."""
+    """Distance between the ends of each spring [S], m, in float64."""
     ends = points.astype(np.float64)[springs.reshape(-1, 2)]
     return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
@@ -172,10 +171,10 @@ def distances(points: np.ndarray, springs: np.ndarray) -> np.ndarray:
 def unloaded(
     nodes: np.ndarray, controllers: np.ndarray, springs: np.ndarray, rest_shape: np.ndarray, controller_rest: str = "rest_shape"
 ) -> np.ndarray:
-    """Distance of the ends of each spring [S], m, in the shape where it has no force (double precision).
+    """Distance between the ends of each spring [S], m, in the shape without forces, in float64.
 
-    That is the rest shape [N + C, 3], m, or frame 0 where it is empty. With `controller_rest` first_frame it is frame 0 for the
-    springs of controllers: hands took hold of the body as it was there.
+    That shape is the rest shape [N + C, 3], m, or frame 0 if the rest shape is empty. With `controller_rest` first_frame, it is
+    frame 0 for controller springs, because the hands grasp the object in its pose of frame 0.
     """
     lengths = distances(canonical_shape(nodes, controllers, rest_shape), springs)
     if controller_rest == "first_frame":
@@ -192,11 +191,11 @@ def build(
     rest_shape: np.ndarray = NO_REST_SHAPE,
     controller_rest: str = "rest_shape",
 ) -> Topology:
-    """A Topology whose rest lengths are the distances of `unloaded` (rounded to float32)."""
+    """A Topology with the rest lengths of `unloaded`, rounded to float32. Raises InputError if a spring has no length."""
     lengths = unloaded(nodes, controllers, springs, rest_shape, controller_rest)
     if (lengths <= 0).any():
         pair = f"zero-length spring {springs[int(np.argmin(lengths))].tolist()}"
-        raise InputError("topology", "a controller may not coincide with an object node", pair, "Move or drop that point.")
+        raise InputError("topology", "a controller may not coincide with an object node", pair, "Move or remove this controller.")
     return Topology(
         nodes=nodes,
         controllers=controllers,
@@ -221,10 +220,16 @@ def piecewise_topology(
     rest_shape: np.ndarray = NO_REST_SHAPE,
     controller_rest: str = "rest_shape",
 ) -> Topology:
-    """A radius [m] and a neighbor count (self included) per region; `labels` [N] says which region a node belongs to.
+    """A topology with a radius and a number of neighbors per region.
 
-    Neighbors are looked for in the rest shape [N + C, 3], m, where one is given, else in frame 0. `repair` makes the body one
-    piece (`joined`). Rest lengths: `unloaded`. Raises InputError if a controller coincides with a node.
+    - labels: region of each node [N]
+    - object_radius, controller_radius: m
+    - object_neighbors: self included
+    - repair: connect all pieces of the object (`joined`)
+    - rest_shape: [N + C, 3], m, in which neighbors are selected; empty: frame 0
+    - controller_rest: see `unloaded`, which defines the rest lengths
+
+    Raises InputError if a controller coincides with a node.
     """
     canonical = np.asarray(canonical_shape(nodes, controllers, rest_shape), np.float64)
     points, hands = canonical[: len(nodes)], canonical[len(nodes) :]
@@ -239,7 +244,7 @@ def piecewise_topology(
 def uniform_topology(
     nodes: np.ndarray, controllers: np.ndarray, object_radius: float, object_neighbors: int, *of_controllers: Any
 ) -> Topology:
-    """One radius [m] and one neighbor count (self included) for the whole object; `of_controllers` are theirs.
+    """A topology with one radius, m, and one number of neighbors (self included); `of_controllers` are those of the controllers.
 
     Raises InputError if a controller coincides with a node.
     """
@@ -248,11 +253,11 @@ def uniform_topology(
 
 
 RADIUS_MARGIN = 1 + 1e-6
-"""Factor on radii, so that the longest spring is made again."""
+"""Factor on inferred radii, so that they include the longest spring."""
 
 
 def infer_controller_radius(topology: Topology) -> tuple[float, int]:
-    """Radius, m, and number of nodes that make the controller springs of a topology again."""
+    """Radius, m, and number of nodes that reproduce the controller springs of a topology."""
     springs = topology.springs[topology.object_spring_count :]
     if not len(springs):
         return 1e-9, 1

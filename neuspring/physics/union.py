@@ -1,8 +1,8 @@
-"""Several twins side by side in one solver: where the points and springs of each stand among those of all.
+"""Several twins in one solver: indices of the points and springs of each twin among those of all.
 
-Twins with the same nodes, which are of one scene, have one table of all springs that any of them has. A spring that a twin lacks
-has no stiffness and no dashpot in it: it adds nothing. Twins of other scenes have a table of their own, since hardly a spring would
-be in both. Smaller ones have points that nothing holds, behind their own, far away, where they meet nobody.
+Twins of one scene have the same nodes and share a table of the springs of all of them. A spring that a twin does not have gets
+zero stiffness and dashpot. Each scene has its own table, because scenes would have hardly any spring in common. Twins with fewer
+nodes are padded with free points, far away from the scene.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from neuspring.core.artifacts import Topology
 from neuspring.physics.parameters import PARAMETERS, Parameters
 
 ASIDE, ASIDE_STEP = 1e4, 1.0
-"""Place along x of the first point that stands for none, and from there to the next, m."""
+"""Position of the first padding point along x, and the distance to the next, m."""
 
 
 class Union:
     """The points and springs of several topologies.
 
-    nodes, controllers    the largest numbers of any
-    sizes                 those of each
-    tables, table         all springs [S, 2] of each table, and the table of each topology
-    places                where each topology's own springs stand in its table
+    nodes, controllers    largest numbers of nodes and controllers
+    sizes                 numbers of nodes and controllers of each topology
+    tables, table         springs [S, 2] of each table, and the table of each topology
+    places                indices of the springs of each topology in its table
     """
 
     def __init__(self, topologies: Sequence[Topology]) -> None:
@@ -46,28 +46,28 @@ class Union:
 
     @property
     def springs(self) -> int:
-        """Springs of the largest table."""
+        """Number of springs of the largest table."""
         return max(map(len, self.tables))
 
     def _shifted(self, topology: Topology) -> np.ndarray:
-        """Springs [S, 2], lower ends first; controllers come behind the nodes of all."""
+        """Springs [S, 2], lower ends first, with controllers after the padded nodes."""
         ends, count = np.sort(topology.springs.astype(np.int64), axis=1), len(topology.nodes)
         return np.where(ends >= count, ends + self.nodes - count, ends)
 
     def of_nodes(self, values: Sequence[torch.Tensor], *, places: bool = False) -> torch.Tensor:
-        """[B, N, 3] from [N_k, 3] of each; the rest is 0, or with `places` where points stand that are none."""
+        """Pad values [N_k, 3] of each twin to [B, N, 3], with 0 or, with `places`, with positions of padding points."""
         rest = values[0].new_zeros((self.nodes, 3))
         if places:
             rest[:, 0] = ASIDE + ASIDE_STEP * torch.arange(self.nodes, device=rest.device)
         return torch.stack([torch.cat([one, rest[len(one) :]]) if len(one) < self.nodes else one for one in values])
 
     def of_controllers(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
-        """[..., B, C, K] from waypoints [..., C_k, K] of each; the rest stays at 0."""
+        """Pad waypoints [..., C_k, K] of each twin to [..., B, C, K], with 0."""
         padded = [torch.nn.functional.pad(one, (0, 0, 0, self.controllers - one.shape[-2])) for one in values]
         return torch.stack(padded, dim=-3)
 
     def parameters(self, each: Sequence[Parameters]) -> Parameters:
-        """The parameters of the twins with a leading axis [B], their springs put where they stand in their table."""
+        """Stack the parameters of the twins with a leading axis [B], with springs in the order of their table."""
         result = {}
         for name, parameter in PARAMETERS.items():
             values = [one[name] for one in each]
@@ -79,11 +79,11 @@ class Union:
                 values = [
                     torch.cat([one, one[-1:].expand(self.nodes - len(one))]) if 1 < len(one) < self.nodes else one for one in values
                 ]
-            # Masses of all nodes at once and of each node may meet.
+            # Some twins may have one mass for all nodes, others a mass per node.
             result[name] = torch.stack(torch.broadcast_tensors(*values))
         return result
 
     def gradients(self, gradients: Parameters, twin: int) -> Parameters:
-        """Those of one of the twins, from those of all."""
+        """Select the gradients of one twin from those of all twins."""
         index = torch.as_tensor(self.places[twin], device=gradients["springs"].device)
         return {name: each[twin][index] if PARAMETERS[name].per == "spring" else each[twin] for name, each in gradients.items()}

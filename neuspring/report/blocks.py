@@ -1,4 +1,4 @@
-"""The parts of a page as values: HTML by a template, which escapes every text; tables, paragraphs and lists also as Markdown."""
+"""The parts of a page as values. A template turns them into HTML and escapes every text; most parts also exist as Markdown."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAGE_TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True, kw_only=True)
 class Text:
-    """A paragraph; `tone` makes it a note, "lead" a large one."""
+    """A paragraph. A `tone` makes it a colored note; the tone "lead" makes it large."""
 
     text: str
     tone: str = ""
@@ -24,7 +24,7 @@ class Text:
 
 @dataclass(frozen=True, kw_only=True)
 class Items:
-    """A list below a title."""
+    """A list with a title."""
 
     items: Sequence[str]
     title: str = ""
@@ -32,7 +32,7 @@ class Items:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture or a film; without `data`, a link to the file and the reason why it is not embedded."""
+    """An image or a video. Without `data`, it is a link to the file with the reason why the file is not embedded."""
 
     caption: str
     alt: str = ""
@@ -42,40 +42,40 @@ class Picture:
     link: str = ""
     reason: str = ""
     wide: bool = False
-    """Keeps a readable width, and scrolls on small screens."""
+    """Keep a readable width and scroll on small screens."""
     paper: bool = False
-    """Drawn for a white page."""
+    """The image requires a white background."""
     panel: int | None = None
-    """The panel that is shown of a film of three side by side; None: all of it."""
+    """Index of the displayed panel of a video with three panels side by side; None: all panels."""
     head: float = 0.0
-    """Height of what is above the panels, over the width of the film."""
+    """Height of the header above the panels, divided by the width of the video."""
     same: bool = False
-    """Another panel of the first film beside it; the page's script adds it, so that no film is there twice."""
+    """The figure shows another panel of the first video in its grid; the script copies the source, so it is embedded once."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """Preformatted text; a click selects all of it, to be copied."""
+    """Preformatted text; a click selects all of it for copying."""
 
     text: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Blocks side by side, as many as fit."""
+    """Blocks side by side, as many as fit into the width."""
 
     blocks: Sequence[Block]
     least: int = 17
-    """Smallest width of a column, rem."""
+    """Minimum width of a column, rem."""
     films: bool = False
-    """The videos among them play in step, with one control, and fill the width."""
+    """The videos play in step with one control and fill the width."""
     training: float = 0.0
-    """Share of the films that is training; 0: the control does not show it."""
+    """Fraction of the videos that is training frames; 0: the control does not show it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fold:
-    """Blocks that are shown on a click."""
+    """Blocks behind a summary; a click shows them."""
 
     summary: str
     blocks: Sequence[Block]
@@ -87,19 +87,19 @@ Block = Table | Text | Items | Picture | Code | Grid | Fold
 
 @dataclass(frozen=True, kw_only=True)
 class PageSection:
-    """A part of the page with an entry in its table of contents."""
+    """A section of the page with an entry in the table of contents."""
 
     key: str
-    """Its name in the registry, and in links to it."""
+    """Name in the registry and anchor of the section."""
     title: str
     blocks: Sequence[Block]
     about: str = ""
     folded: bool = False
-    """Shown on a click on its title."""
+    """A click on the title shows the section."""
 
 
 def markdown(blocks: Sequence[Block]) -> str:
-    """Tables, paragraphs, lists and code as Markdown; folds are open. Pictures are left out."""
+    """Tables, paragraphs, lists and code as Markdown. Folds are open; images are omitted."""
     parts = []
     for block in blocks:
         if isinstance(block, Table):
@@ -119,7 +119,7 @@ def markdown(blocks: Sequence[Block]) -> str:
 
 
 def html_page(title: str, subtitle: str, sections: Sequence[PageSection], *, written: str = "") -> str:
-    """The page as text; nothing but what it contains may be loaded."""
+    """The page as HTML; its security policy blocks every request to other files."""
     loader = jinja2.FileSystemLoader(PAGE_TEMPLATES)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters |= {"coded": coded, "lay_out": lay_out}

@@ -1,4 +1,4 @@
-"""Material of a report page: runs, jobs and records of a results folder. Damaged files are listed and stop nothing."""
+"""Data of a report page: runs, jobs and records of a results folder. Damaged files are listed and skipped."""
 
 from __future__ import annotations
 
@@ -27,60 +27,60 @@ from neuspring.scores.table import DAMAGED, LeftOut, ScoreTable, one_line
 
 Value = TypeVar("Value")
 PERCEPTION = "perception"
-"""Kind of the pictures that perception left of a scenario, and their folder in it."""
+"""Kind of the images that perception writes, and their folder in a scenario's folder."""
 MARKUP = 400
-"""Characters around an embedded picture."""
+"""Characters of HTML around an embedded image."""
 NO_ROOM = "not embedded, to keep this page small"
 MOST_ROWS = 400
-"""At most so many rows of a list are shown."""
+"""Maximum number of displayed rows of a list."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Subject of the report. What is left empty is taken from the settings, else from what is in the results folder."""
+    """Subject of the report. Empty fields are filled from the settings, else from the results folder."""
 
     scenarios: Sequence[str] = ()
     methods: Sequence[str] = ()
     seeds: Sequence[int] = ()
     baseline: str | None = None
-    """The method that others are compared with; None: the settings', else the first."""
+    """Method that all other methods are compared with; None: the baseline of the settings, else the first method."""
     transfers: Sequence[str] = ()
-    """Scenarios whose twins were rolled out on other recordings."""
+    """Scenarios whose twins also predict other recordings (transfer)."""
     left_out: LeftOut = field(default_factory=dict)
     """Method -> scenarios to which it does not apply -> reason."""
     shown: Sequence[str] = ()
-    """Methods whose curves and pictures are shown; empty: the baseline and the first methods of the studies, six in all."""
+    """Methods with curves and images; empty: the baseline and the first methods of the studies, six in total."""
     settings: Config | None = None
     studies: Mapping[str, Study] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
-    """Method -> its name for people, of those that have one."""
+    """Method -> displayed name, for methods with a title."""
     tables: str = "tables"
     """Folder of tables in the results folder."""
     megabytes: float = 25.0
-    """Largest size of the page. Pictures and videos that do not fit are linked."""
+    """Maximum size of the page, MB. Images and videos that do not fit are linked."""
     video_megabytes: float = 8.0
-    """Largest part of that for videos."""
+    """Maximum size of the embedded videos, MB; part of `megabytes`."""
 
 
 @dataclass(kw_only=True)
 class ReportData:
-    """Everything that the sections read."""
+    """The data that all sections read."""
 
     results: Path
     output: Path
     choice: Options
-    """With nothing left empty."""
+    """The options with all empty fields filled."""
     numbers: Compared
     jobs: Sequence[JobRecord]
     damaged: dict[str, str]
-    """Files that cannot be read, relative to the results folder, and why."""
+    """Unreadable file, relative to the results folder -> reason."""
     room: int = 0
-    """Characters that pictures and films may take."""
+    """Characters that are left for images and videos."""
     film_room: int = 0
-    """Characters of these that films may take."""
+    """Characters of `room` that are left for videos."""
 
     def take(self, size: int, film: bool = False) -> bool:
-        """True, and the room is taken, where a picture or film of this size still fits."""
+        """Reserve `size` characters for an image or video; returns False if it does not fit."""
         if size + MARKUP > (min(self.room, self.film_room) if film else self.room):
             return False
         self.room -= size + MARKUP
@@ -94,7 +94,7 @@ class ReportData:
 
     @property
     def runs(self) -> list[RunRecord]:
-        """The runs whose records could be read."""
+        """The runs with readable records."""
         return list(self.table.records.values())
 
     def folder(self, run: RunRecord) -> Path:
@@ -102,7 +102,7 @@ class ReportData:
         return self.results / run.name
 
     def file(self, run: RunRecord, kind: str, stem: str) -> Path | None:
-        """A file that a run's record names, or a picture of perception (of the first camera); None where there is none."""
+        """A file that the run's record names, or an image of perception (first camera); None if it does not exist."""
         if kind == PERCEPTION:
             folder = self.results / run.scenario / PERCEPTION
             return next((path for path in (folder / f"{stem}.png", *sorted(folder.glob(f"*/{stem}.png"))) if path.is_file()), None)
@@ -110,12 +110,12 @@ class ReportData:
         return next((path for path in paths if path.stem == stem and path.is_file()), None)
 
     def relative(self, path: Path) -> str:
-        """A path for people: relative to the results folder."""
-        place, results = path.resolve(), self.results.resolve()
-        return place.relative_to(results).as_posix() if place.is_relative_to(results) else str(path)
+        """The path relative to the results folder, for display; paths outside the folder stay as they are."""
+        absolute, results = path.resolve(), self.results.resolve()
+        return absolute.relative_to(results).as_posix() if absolute.is_relative_to(results) else str(path)
 
     def read(self, path: Path, read: Callable[[Path], Value]) -> Value | None:
-        """The content of a file, read by a function; None, and remembered, for a damaged one."""
+        """The content of a file by the function `read`. A damaged file is added to `damaged` and gives None."""
         try:
             return read(path)
         except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError, SyntaxError) as error:
@@ -123,29 +123,29 @@ class ReportData:
             return None
 
     def observations(self, scenario: str) -> Observations | None:
-        """What was observed of a scenario; None where that is not there or damaged."""
+        """The observations of a scenario; None if the file is missing or damaged."""
         path = self.results / scenario / "observations.npz"
         return self.read(path, Observations.load) if path.is_file() else None
 
     def first_runs(self, scenario: str) -> dict[str, RunRecord]:
-        """Shown method -> its first run of a scenario, finished ones before failed ones."""
+        """Displayed method -> its first finished run of a scenario, else its first failed run."""
         runs = [run for run in self.runs if run.scenario == scenario]
-        own = {method: [run for run in runs if run.method == method] for method in self.choice.shown}
-        return {method: min(found, key=lambda run: not run.ok) for method, found in own.items() if found}
+        by_method = {method: [run for run in runs if run.method == method] for method in self.choice.shown}
+        return {method: min(candidates, key=lambda run: not run.ok) for method, candidates in by_method.items() if candidates}
 
 
 def traces(results: Path) -> tuple[list[str], list[str], list[int]]:
-    """Scenarios, methods and seeds that have left a record of a stage."""
+    """Scenarios, methods and seeds for which the results folder contains a record of a stage."""
     paths = [path for name in (RUN_RECORD, "rollout.json", "fit.json", "train.json") for path in results.glob(f"*/*/*/{name}")]
     paths += results.glob("*/search-*/*/search.json")
-    found = [parts for path in paths if (parts := path.relative_to(results).parts)[2].isdigit()]
-    methods = {parts[1] for parts in found if not parts[1].startswith("search-")}
-    return sorted({parts[0] for parts in found}), sorted(methods), sorted({int(parts[2]) for parts in found})
+    runs = [parts for path in paths if (parts := path.relative_to(results).parts)[2].isdigit()]
+    methods = {parts[1] for parts in runs if not parts[1].startswith("search-")}
+    return sorted({parts[0] for parts in runs}), sorted(methods), sorted({int(parts[2]) for parts in runs})
 
 
 def damaged_files(table: ScoreTable, messages: Sequence[str], results: Path) -> dict[str, str]:
-    """Records of runs, transfers and jobs that cannot be read, relative to the results folder, and why."""
-    # Messages on job records begin with the file.
+    """Unreadable record of a run, transfer or job, relative to the results folder -> reason."""
+    # A message about a job record starts with the path of its file.
     parts = (message.partition(": ") for message in messages)
     damaged = {Path(path).relative_to(results).as_posix(): reason for path, _, reason in parts}
     rows: list[Any] = list(table.runs.itertuples())
@@ -155,27 +155,27 @@ def damaged_files(table: ScoreTable, messages: Sequence[str], results: Path) -> 
 
 
 def link(path: Path, folder: Path) -> str:
-    """A relative link from a page in `folder`."""
+    """Relative link to `path` from a page in `folder`."""
     return quote(Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix())
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSection:
-    """A section of the report: the member of a registry that a module of `sections`, or of a package, declares."""
+    """A section of the report; a module of `sections` or of an extension declares it as a member of the registry."""
 
     order: int
-    """Its position on the page, by tens; behind 30 it is folded."""
+    """Position on the page, in steps of ten; a section with an order above 30 is folded."""
     title: str
     make: Callable[[ReportData], Sequence[Block]]
-    """Its blocks; none where there is nothing to show."""
+    """Returns the blocks; an empty list omits the section."""
     about: str = ""
     """A sentence below the title."""
     phase: Literal[0, 1, 2] = 0
-    """1: it takes the `room` that all others leave; 2: it lists the damaged files that all others found."""
+    """1: made after phase 0, because it fills the remaining `room`; 2: made last, because it lists all damaged files."""
 
 
 def shown_figure(figure: Figure, caption: str) -> Picture:
-    """A figure as SVG in the page; closes it."""
+    """Convert a figure to SVG and close it."""
     stream = io.BytesIO()
     with plt.rc_context({"svg.hashsalt": caption}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
@@ -184,7 +184,7 @@ def shown_figure(figure: Figure, caption: str) -> Picture:
 
 
 def webp(picture: Image.Image, width: int) -> str:
-    """Data URI of a picture, not wider than `width`."""
+    """Data URI of an image, at most `width` pixels wide."""
     picture, stream = picture.convert("RGB"), io.BytesIO()
     picture.thumbnail((width, 10 * width))
     picture.save(stream, "WEBP", quality=75)
@@ -192,5 +192,5 @@ def webp(picture: Image.Image, width: int) -> str:
 
 
 def data_uri(kind: str, data: bytes) -> str:
-    """Bytes as the source of a picture or film."""
+    """Data URI of an image or video."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,7 +1,7 @@
-"""The report: one HTML file that opens with the verdict and shows everything that a results folder holds.
+"""The report: one HTML file that starts with the verdict and shows the content of a results folder.
 
-It needs no network and no script. It is made from files on disk, also while a benchmark runs, and lists the files that it cannot
-read.
+The page requires neither network nor scripts. It is made from the files on disk, also while a benchmark runs, and lists unreadable
+files.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ LAST_OPEN, MOST_SHOWN = 30, 6
 def write(results: Path, output: Path, options: Options, written: str | None = None) -> Path:
     """Write the report of a results folder as one HTML file; returns its path.
 
-    Raises InputError without the folder, or if a method to show or to compare with is not among the methods.
+    Raises InputError if the folder does not exist, or if `shown` or `baseline` names a method that is not among the methods.
     """
     results = Path(results)
     if not results.is_dir():
-        raise InputError(results, "the results folder must exist", "no such folder", "Run the workflow first, or name another.")
+        raise InputError(results, "the results folder must exist", None, "Run the workflow first, or pass another folder.")
     material, written = gather(results, Path(output), options), written or now()
     choice = material.choice
     counts = [several(len(getattr(choice, f"{noun}s")), noun) for noun in ("scenario", "method", "seed")]
-    subtitle = f"{', '.join(counts)}; {results.resolve().name}."
+    subtitle = f"{', '.join(counts)} in the folder {results.resolve().name}."
     ordered = sorted(REPORT_SECTIONS.items(), key=lambda pair: (pair[1].order, pair[0]))
     made = {}
 
@@ -48,13 +48,14 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
 
     def page() -> str:
         sections = [
-            PageSection(key=name, title=one.title, blocks=blocks, about=one.about, folded=one.order > LAST_OPEN)
-            for name, one in ordered
+            PageSection(key=name, title=section.title, blocks=blocks, about=section.about, folded=section.order > LAST_OPEN)
+            for name, section in ordered
             if (blocks := made.get(name))
         ]
-        return html_page("NeuSpring: report", subtitle, sections, written=written)
+        return html_page("NeuSpring report", subtitle, sections, written=written)
 
-    # Pictures take the room that all else leaves. What lists damaged files is made again last: pictures may be damaged too.
+    # Images fill the size that the other sections leave. Sections that list damaged files are made again, because reading images
+    # may find more of them.
     make(0)
     make(2)
     material.room, material.film_room = int(1e6 * choice.megabytes) - len(page().encode()), int(1e6 * choice.video_megabytes)
@@ -65,7 +66,7 @@ def write(results: Path, output: Path, options: Options, written: str | None = N
 
 
 def gather(results: Path, output: Path, options: Options) -> ReportData:
-    """Read what the report is about."""
+    """Read the data of the report."""
     messages: list[str] = []
     jobs = read_jobs(results, messages)
     choice = _filled(results, options)
@@ -79,16 +80,18 @@ def gather(results: Path, output: Path, options: Options) -> ReportData:
 
 
 def _filled(results: Path, options: Options) -> Options:
-    """The options with nothing left empty."""
-    settings, there = options.settings or Config(), traces(results)
+    """The options with all empty fields filled."""
+    settings, available = options.settings or Config(), traces(results)
     in_studies = [method for study in options.studies.values() for method in study.rows.values()]
-    on_disk = sorted(there[1], key=lambda name: in_studies.index(name) if name in in_studies else len(in_studies))
-    scenarios = tuple(options.scenarios or settings.scenarios or there[0])
+    on_disk = sorted(available[1], key=lambda name: in_studies.index(name) if name in in_studies else len(in_studies))
+    scenarios = tuple(options.scenarios or settings.scenarios or available[0])
     methods = tuple(options.methods or settings.methods or on_disk)
-    seeds = tuple(options.seeds or ((settings.seeds if options.settings else ()) or there[2]))
+    seeds = tuple(options.seeds or ((settings.seeds if options.settings else ()) or available[2]))
     for name in (*options.shown, *([options.baseline] if options.baseline else [])):
         if name not in methods:
-            raise InputError("report", "methods that are drawn or compared with must be among the methods", name, listed(methods))
+            raise InputError(
+                "report", "baseline and shown methods must be among the methods", name, f"Choose from {listed(methods)}."
+            )
     offered = [options.baseline or settings.compare_with, *(study.rows[study.baseline] for study in options.studies.values())]
     baseline = next((name for name in [*offered, *methods] if name in methods), "")
     finished = {path.parts[-3] for path in results.glob("*/*/*/run.json")}

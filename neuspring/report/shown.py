@@ -1,6 +1,6 @@
-"""The content of a results folder to look at: its scenario, its runs, and what is missing of each.
+"""The runs of a scenario in a results folder, for viewers, exports and figures, with a note on everything that is missing.
 
-Files are not trusted: sizes of arrays are checked before they are read, and names must stay inside the scenario's folder.
+The files are not trusted: array sizes are checked before arrays are read, and paths must stay inside the scenario's folder.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ Kind = TypeVar("Kind", bound=Artifact)
 OBSERVATIONS, ROLLOUT = "observations.npz", "rollout.json"
 SEED = re.compile(r"\d{1,9}")
 SHOWN_FIRST = ("neuspring", "baseline")
-"""Methods that are shown first."""
+"""Methods that are listed first."""
 MOST_RUNS = 200
-"""Runs that are looked at in a scenario's folder."""
+"""Maximum number of runs that are read from a scenario's folder."""
 MOST_BYTES = 2 * 1024**3
-"""Largest file, unpacked, that is opened."""
+"""Maximum unpacked size of a file, bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run: a method with a seed. Its arrays are read when they are asked for."""
+    """One run: a method with a seed. Each file is read when its property is first used."""
 
     folder: Path
     notes: tuple[str, ...] = ()
-    """Faults and gaps that a viewer must know."""
+    """Faults and missing files, for display."""
     paths: Mapping[str, Path] = field(default_factory=dict)
-    """Files that it has: twin, trajectory, splats, and centers, where the method's own model puts its splats."""
+    """Role -> existing file. Roles: twin, trajectory, splats, centers (of splats that the method's own model moves)."""
 
     @property
     def method(self) -> str:
-        """Its row of the method table."""
+        """Name in the method table."""
         return self.folder.parent.name
 
     @property
     def seed(self) -> str:
-        """Its seed."""
+        """The seed, as text."""
         return self.folder.name
 
     @property
@@ -62,24 +62,24 @@ class Run:
 
     @cached_property
     def twin(self) -> Twin | None:
-        """The twin, where the method has one. Raises InputError."""
+        """The twin, or None. Raises InputError if the file is damaged or too large."""
         return self._read("twin", Twin)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
-        """The prediction, where there is one. Raises InputError."""
+        """The prediction, or None. Raises InputError if the file is damaged or too large."""
         return self._read("trajectory", Trajectory)
 
     @cached_property
     def splats(self) -> Splats | None:
-        """The splats that pictures of this run show, in frame 0, if it has any. Raises InputError."""
+        """The rendered splats in frame 0, or None. Raises InputError if the file is damaged."""
         splats = self._read("splats", Splats)
-        # As pictures (stages/render.py): where a method's own model moves them, all of them are drawn.
+        # The same splats as in stages/render.py, which keeps all splats that the method's own model moves.
         return splats if splats is None or "centers" in self.paths else prune_by_opacity(splats)
 
     @cached_property
     def centers(self) -> SplatCenters | None:
-        """The centers at which the method's own model puts its splats, if it does. Raises InputError."""
+        """Splat centers from the method's own model, or None. Raises InputError if the file is damaged or too large."""
         return self._read("centers", SplatCenters)
 
     def _read(self, role: str, kind: type[Kind]) -> Kind | None:
@@ -92,40 +92,44 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A scenario's folder: what was observed, and runs."""
+    """A scenario's folder: observations, runs and capture."""
 
     folder: Path
     observations: Observations
     runs: tuple[Run, ...]
     shown: tuple[str, ...]
-    """Names of the runs to begin with."""
+    """Names of the initially displayed runs."""
     capture: Capture | None = None
     notes: tuple[str, ...] = ()
 
 
 def find(paths: Sequence[Path]) -> Found:
-    """The scenario and the runs of folders: one scenario's folder, or one or several runs of one scenario. Raises InputError."""
+    """Find the scenario and the runs of `paths`: the folder of one scenario, or runs of one scenario.
+
+    Raises InputError if a path is neither, if the paths belong to several scenarios, or if there is no run.
+    """
     named, scenarios = list[Path](), list[Path]()
     for path in map(Path, paths):
-        place = path.resolve()
-        if _is_run(place) and (place.parents[1] / OBSERVATIONS).is_file():
-            named.append(place)
-        elif not (place / OBSERVATIONS).is_file():
-            rule = f"must be a scenario's folder, which has {OBSERVATIONS}, or a run <scenario>/<method>/<seed>"
-            raise InputError(path, rule, _content(place), "Give results/<scenario>, or a run in it.")
-        scenarios.append(place.parents[1] if place in named else place)
+        folder = path.resolve()
+        if _is_run(folder) and (folder.parents[1] / OBSERVATIONS).is_file():
+            named.append(folder)
+        elif not (folder / OBSERVATIONS).is_file():
+            rule = f"must be a scenario's folder with {OBSERVATIONS}, or a run <scenario>/<method>/<seed>"
+            raise InputError(path, rule, _content(folder), "Give results/<scenario>, or a run in it.")
+        scenarios.append(folder.parents[1] if folder in named else folder)
     if len(set(scenarios)) != 1:
-        raise InputError(", ".join(map(str, paths)), "all runs must be of one scenario", len(set(scenarios)))
+        rule = "all runs must belong to one scenario"
+        raise InputError(", ".join(map(str, paths)), rule, f"{len(set(scenarios))} scenarios")
     folder = scenarios[0]
     require_modest(folder / OBSERVATIONS)
     observations = Observations.load(folder / OBSERVATIONS)
-    whole = len(named) < len(paths)
-    below = (place for place in folder.glob("*/*") if place.is_dir() and not place.is_symlink() and _is_run(place))
-    places = sorted({*named, *(below if whole else ())}, key=_rank)
-    runs = tuple(_run(place, folder) for place in places[:MOST_RUNS])
-    notes = [] if len(places) <= MOST_RUNS else [f"{len(places) - MOST_RUNS} runs are left out"]
+    has_scenario = len(named) < len(paths)
+    inside = (path for path in folder.glob("*/*") if path.is_dir() and not path.is_symlink() and _is_run(path))
+    run_folders = sorted({*named, *(inside if has_scenario else ())}, key=_rank)
+    runs = tuple(_run(path, folder) for path in run_folders[:MOST_RUNS])
+    notes = [] if len(run_folders) <= MOST_RUNS else [f"{len(run_folders) - MOST_RUNS} runs are not shown"]
     if not runs:
-        raise InputError(folder, "must have at least one run <method>/<seed>", _content(folder), "Run the benchmark first.")
+        raise InputError(folder, "must contain at least one run <method>/<seed>", _content(folder), "Run the workflow first.")
     shown = tuple(run.name for run in runs if run.folder in named) or _first(runs)
     return Found(folder, observations, runs, shown, capture_of(folder, observations, notes), tuple(notes))
 
@@ -140,49 +144,51 @@ def _rank(path: Path) -> tuple[int, str, int]:
 
 
 def _first(runs: Sequence[Run]) -> tuple[str, ...]:
-    """The first run, and the first one of another method."""
+    """Names of the first run and of the first run of another method with a twin."""
     usable = [run for run in runs if "trajectory" in run.paths] or list(runs)
     other = next((run for run in usable if run.method != usable[0].method and "twin" in run.paths), None)
     return tuple(run.name for run in (usable[0], other) if run is not None)
 
 
 def _run(folder: Path, scenario_folder: Path) -> Run:
-    """A run with what can be used of it; a record that cannot be read is a note."""
+    """A run with its usable files; unusable files and records become notes."""
     notes: list[str] = []
     run = RunFolder.of(folder, notes)
     model = "fit" if "fit" in run.stages else "search"
-    places = {"twin": model, "trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
+    stages = {"twin": model, "trajectory": "rollout", "centers": "rollout", "splats": "appearance"}
     paths = {}
-    for role, stage in places.items():
+    for role, stage in stages.items():
         try:
-            if (found := run.file(stage, role)) is None:
+            if (path := run.file(stage, role)) is None:
                 continue
-            if not found.resolve().is_relative_to(scenario_folder):
-                remedy = "A record of a results folder names files of its scenario."
-                raise InputError(found, f"must lie inside {scenario_folder}", str(found.resolve()), remedy)
-            paths[role] = found.resolve()
+            if not path.resolve().is_relative_to(scenario_folder):
+                raise InputError(path, f"must be inside {scenario_folder}", str(path.resolve()), "Copy the file there.")
+            paths[role] = path.resolve()
         except (InputError, TypeError, ValueError, IndexError) as error:
             notes.append(f"no {'prediction' if role == 'trajectory' else role}: {error}")
     if "rollout" in run.stages and run.records["rollout"].status == "failed":
         notes.append(f"failed: {run.records['rollout'].reason}")
     if "trajectory" not in paths and not notes:
-        notes.append("no prediction in its record")
+        notes.append("its record names no prediction")
     return Run(folder, tuple(notes), paths)
 
 
 def capture_of(folder: Path, observations: Observations, notes: list[str]) -> Capture | None:
-    """The capture in a scenario's folder, or the user's own that its record names; why one cannot be used goes to `notes`."""
+    """The capture in a scenario's folder, or else the user's capture that the record names.
+
+    Returns None without a usable capture; the reason is appended to `notes`.
+    """
     path = folder / "capture" / CAPTURE
     try:
         if not path.is_file():
             record = (folder / OBSERVATIONS).with_suffix(".json")
-            own = StageRecord.load(record).facts.get(CAPTURE_FOLDER) if record.is_file() else None
-            if own is None:
+            named = StageRecord.load(record).facts.get(CAPTURE_FOLDER) if record.is_file() else None
+            if named is None:
                 return None
-            # Named by a record, and so only believed if it is the one that was observed.
-            path = Path(str(own)) / CAPTURE
+            # A record is not trusted: the digest proves that the named capture is the observed one.
+            path = Path(str(named)) / CAPTURE
             if observations.scenario.provenance.get(CAPTURE) != f"sha256:{digest_file(path)}":
-                raise InputError(path, "must be the capture of this run", "one that was changed since", "Run the benchmark again.")
+                raise InputError(path, "must be the capture of this run", "a changed capture", "Run the workflow again.")
         return Capture.load(path.parent)
     except (InputError, OSError) as error:
         notes.append(f"no cameras: {error}")
@@ -196,19 +202,19 @@ def _content(folder: Path) -> str:
 
 
 def require_modest(path: Path) -> None:
-    """Raise InputError for an `.npz` file whose arrays would not fit `MOST_BYTES`, or whose headers promise more than it holds."""
+    """Raise InputError if an `.npz` file has more than `MOST_BYTES` of arrays, or less data than its headers declare."""
     if not path.is_file():
-        raise InputError(path, "this file must exist", "no such file", "Run the step that makes it first.")
+        raise InputError(path, "this file must exist", None, "Run the stage that writes it.")
     try:
         shapes, _ = read_head(path)
         with zipfile.ZipFile(path) as archive:
             sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
     except (DamagedFile, zipfile.BadZipFile, OSError) as error:
-        raise InputError(path, "this file must be readable", str(error), "Delete it and run its step again.") from error
+        raise InputError(path, "this file must be readable", str(error), "Delete it and rerun its stage.") from error
     if sum(sizes.values()) > MOST_BYTES:
-        rule = f"at most {MOST_BYTES / 1e9:.1f} GB are opened"
-        raise InputError(path, rule, f"{sum(sizes.values()) / 1e9:.1f} GB", "Show a smaller run.")
+        rule = f"the unpacked size must be at most {MOST_BYTES / 1e9:.1f} GB"
+        raise InputError(path, rule, f"{sum(sizes.values()) / 1e9:.1f} GB", "Choose a smaller run.")
     for name, shape in shapes.items():
         if name != META and math.prod(shape) > sizes[name]:
-            rule = f"the header of {name} must agree with its content of {sizes[name]} bytes"
-            raise InputError(path, rule, f"shape {shape}", "Delete it and run its step again.")
+            rule = f"the header of {name} must match its size of {sizes[name]} bytes"
+            raise InputError(path, rule, f"shape {shape}", "Delete the file and rerun its stage.")

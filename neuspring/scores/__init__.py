@@ -1,7 +1,8 @@
 """Scores: metrics, the long table of a benchmark, averages and their intervals, the paper's values.
 
-- `metrics`: `METRICS`, the registry of metrics, and scores of a run; `carried`: points that move with nodes; `pictures`, `lpips`.
-- `table`: the long table; `queries`: averages, duels of methods, failures on it.
+- `metrics`: the registry `METRICS` and the scores of a run; `carried`: points that move with nodes.
+- `pictures`, `lpips`: image metrics.
+- `table`: the long table; `queries`: averages, duels of methods and failures.
 - `statistics`: ratios over objects, paired differences, aims, 95 % intervals.
-- `paper`, `study`: what the paper printed, and ours beside it.
+- `paper`, `study`: the published values, and ours side by side with them.
 """

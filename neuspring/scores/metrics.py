@@ -1,14 +1,14 @@
-"""The metrics: what they measure, the functions that compute them, and how tables show them; averages of scores.
+"""The metrics: definitions, functions and table formats; scores of a run, and averages of scores.
 
-Chamfer distance: each visible observed point to its nearest surface node, one direction, in the L1 norm |dx| + |dy| + |dz|.
-Track error: annotated tracks, matched to the nearest of all nodes at frame 0, Euclidean distance.
-Both follow the released evaluation of PhysTwin. The track error has a floor, its value in frame 0. The bound track error has none:
-its points move with the nodes around them (`carried`).
-Metrics of pictures are computed in `pictures` and `lpips`.
+- Chamfer distance: from each visible observed point to its nearest surface node, one direction, L1 norm |dx| + |dy| + |dz|.
+- Track error: from annotated tracks to the nearest of all nodes in frame 0, Euclidean distance. Its value in frame 0 is its floor.
+- Bound track error: the same for points that move with the nodes around them (`carried`), without a floor.
 
-A metric is one member of `METRICS` and carries its function: it is computed wherever runs are scored, and stands in all tables.
+The first two follow the released evaluation of PhysTwin. `pictures` and `lpips` compute the image metrics.
 
-pandas and SciPy are imported where they are used, because the workflow reads the declarations at its start.
+Every member of `METRICS` contains its function, so it is computed for all runs and appears in all tables.
+
+pandas and SciPy are imported inside functions, because the workflow reads these declarations at its start.
 """
 
 from __future__ import annotations
@@ -38,85 +38,89 @@ SHORT = {"reconstruction": "Recon.", "future": "Future", "transfer": "Transfer"}
 """Tasks in headings of columns."""
 SCORE_COLUMNS = ("scenario", "category", "method", "seed", "task", "metric", "value", "unit", "frames")
 DASH = "–"
-"""Stands for a value that there is not."""
+"""Printed for a missing value."""
 Of = Literal["positions", "pictures", "marks"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A metric: the function that computes it, and how tables show it."""
+    """A metric: its function and its format in tables."""
 
     name: str
     title: str
-    """In words, for legends."""
+    """Name in legends."""
     heading: str
     unit: str
-    """Unit of stored values; 1 for plain numbers."""
+    """Unit of stored values; "1" for plain numbers."""
     shown_unit: str = ""
-    """In tables; empty for plain numbers."""
+    """Unit in tables; empty for plain numbers."""
     factor: float = 1.0
-    """From the stored unit to that of tables."""
+    """Factor from the stored unit to the unit of tables."""
     digits: int
-    """After the point, in tables."""
+    """Digits after the decimal point in tables."""
     better: Literal["lower", "higher", "neither"] = "lower"
-    """Values that are better; neither: tables name no best one."""
+    """Direction of better values; neither: tables do not mark a best value."""
     relative: bool = True
-    """True where a change in per cent means something. It does not in dB."""
+    """True if a relative change is meaningful; it is not in dB."""
     of: Of = "positions"
-    """Positions of nodes in space; pictures; points that were marked in images, where there is color alone."""
+    """Input: node positions; images; or points annotated in images (marks), for captures without depth."""
     function: Callable[..., Any] | str
-    """Function that computes it. Of positions and marks: (positions [F, N, 3] m, observations) -> values per frame
-    [F], NaN where a frame has none, or None where the metric does not apply. Of pictures: (`pictures.Pair`, LPIPS of two pictures
-    or None) -> a value or None. Text "module:name" is imported when it is first called."""
-    in_studies: bool = False
-    """True where tables of studies show it too."""
-    average: Literal["equal", "frames"] = "equal"
-    """The paper's average over scenarios: equally, or weighted by their frames."""
-    tolerance: float = 1e-6
-    """Largest difference, in the stored unit, from a published value of the same data that conformance checks allow.
+    """Function that computes the metric.
 
-    Distances: single precision and its order of summation. Pictures: those of the stand-in agree within 1e-6 dB with another
-    drawing in double precision, while half a pixel moves them by 0.2 dB and 0.017 IoU; other rasterizers lie between.
+    - Positions and marks: (positions [F, N, 3] m, observations) -> values per frame [F]. NaN: the frame has no value. None instead
+      of an array: the metric does not apply.
+    - Pictures: (`pictures.Pair`, `pictures.Perceptual` or None) -> a value or None.
+
+    A text "module:name" is imported at the first call."""
+    in_studies: bool = False
+    """True if tables of studies also show it."""
+    average: Literal["equal", "frames"] = "equal"
+    """Weights of scenarios in the paper's average: equal, or by frames."""
+    tolerance: float = 1e-6
+    """Largest difference from a published value, in the stored unit, that conformance checks accept.
+
+    Distances differ by single precision and its order of summation. Image metrics differ between rasterizers: two double-precision
+    renderings agree within 1e-6 dB, a shift of half a pixel causes 0.2 dB and 0.017 IoU.
     """
     explained: str = ""
-    """In words, below the heading of summaries; empty: the title."""
+    """Explanation below a summary table; empty: none."""
     paper_name: str = ""
-    """In paper_tables.csv; empty for metrics that the paper does not have."""
+    """Name in paper_tables.csv; empty for metrics that the paper does not report."""
 
-    def measure(self, *given: Any) -> Any:
-        """Values that the function returns."""
-        return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*given)
+    def measure(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return (resolve_name(self.function) if isinstance(self.function, str) else self.function)(*arguments)
 
     @property
     def is_error(self) -> bool:
-        """True where methods are compared by ratios."""
+        """True if methods are compared by ratios of this metric."""
         return self.of == "positions" and self.better == "lower"
 
     @property
     def label(self) -> str:
-        """For an axis: heading and unit."""
+        """Label of an axis: heading and stored unit."""
         return self.heading if self.unit == "1" else f"{self.heading} [{self.unit}]"
 
     @property
     def column(self) -> str:
-        """The heading of a column, with the sign of plain per cents."""
+        """Heading of a table column, with "%" for percentages."""
         return f"{self.heading} %" if self.shown_unit == "%" else self.heading
 
     def text(self, value: float, sign: str = "") -> str:
-        """A stored value as tables print it."""
+        """A stored value in the format of tables."""
         return self.shown(self.factor * value, sign)
 
     def told(self, value: float) -> str:
-        """A stored value with heading and unit, for a sentence."""
+        """A stored value with heading and unit, for running text."""
         return f"{self.heading} {self.text(value)} {self.shown_unit}".rstrip()
 
     def shown(self, value: float, sign: str = "") -> str:
-        """A value in the unit of tables as they print it; a dash for NaN."""
+        """A value that already is in the unit of tables, in their format; a dash for NaN."""
         return DASH if np.isnan(value) else f"{value:{sign}.{self.digits}f}"
 
 
 def present(table: pd.DataFrame) -> set[tuple[str, str]]:
-    """The pairs of task and metric that a table has rows of."""
+    """The pairs of task and metric in a table."""
     return set(zip(table["task"], table["metric"], strict=True))
 
 
@@ -133,14 +137,14 @@ def _table(rows: Iterable[tuple[object, ...]]) -> pd.DataFrame:
 
 
 def visible_to_surface(nodes: np.ndarray, points: np.ndarray, visible: np.ndarray, surface: int) -> float:
-    """Mean L1 distance, m, from the visible points [P, 3] to the first `surface` nodes [N, 3]. NaN where no point is visible."""
+    """Mean L1 distance, m, from the visible points [P, 3] to the first `surface` nodes [N, 3]; NaN if no point is visible."""
     if not len(seen := points[visible].astype(np.float64)):
         return float("nan")
     return float(_tree(nodes[:surface]).query(seen, p=1)[0].mean())
 
 
 def chamfer_per_frame(positions: np.ndarray, observations: Observations) -> np.ndarray:
-    """Mean L1 distance per frame [T], m, from visible points to surface nodes. NaN where no point is visible."""
+    """Mean L1 distance per frame [T], m, from visible points to surface nodes; NaN if no point is visible."""
     surface, points, visible = observations.surface_count, observations.object_points, observations.object_visibility
     return np.array([visible_to_surface(nodes, points[t], visible[t], surface) for t, nodes in enumerate(positions)])
 
@@ -148,21 +152,21 @@ def chamfer_per_frame(positions: np.ndarray, observations: Observations) -> np.n
 def track_errors(positions: np.ndarray, tracks: np.ndarray) -> np.ndarray:
     """Mean Euclidean error per frame [F], m, of positions [F, N, 3] against annotated tracks [F, K, 3]; NaN: not annotated.
 
-    Tracks annotated at frame 0 are matched once, to the nearest of all nodes. A frame without any of them scores 0, as
-    published. NaN everywhere when no track is annotated at frame 0.
+    Tracks annotated in frame 0 are matched once, to the nearest of all nodes. A frame without any of them scores 0, as published.
+    All frames are NaN if no track is annotated in frame 0.
     """
     tracks = tracks.astype(np.float64)
     return _mean_errors(positions, tracks, lambda points: positions[:, _tree(positions[0]).query(points)[1]].astype(np.float64))
 
 
 def bound_track_errors(positions: np.ndarray, tracks: np.ndarray, neighbors: int = CARRIERS) -> np.ndarray:
-    """As `track_errors`, of points that move with the nodes around them (`carried.bound_positions`): 0 for every rigid motion."""
+    """As `track_errors`, for points that move with the nodes around them (`carried.bound_positions`); 0 for every rigid motion."""
     tracks = tracks.astype(np.float64)
     return _mean_errors(positions, tracks, lambda points: bound_positions(positions, points, neighbors))
 
 
 def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Mean distance per frame [F] of the tracks that frame 0 has from where the prediction carries their points [F, P, 3]."""
+    """Mean distance per frame [F] between the tracks of frame 0 and their predicted points, `carried(points [P, 3])` [F, P, 3]."""
     annotated = ~np.isnan(tracks).any(axis=2)
     matched = annotated[0]
     if not matched.any():
@@ -171,14 +175,14 @@ def _mean_errors(positions: np.ndarray, tracks: np.ndarray, carried: Callable[[n
     return means(error, annotated[:, matched], 0.0)
 
 
-def _of_marks(positions: np.ndarray, observations: Observations, *, on_table: bool) -> np.ndarray | None:
-    """Errors of marked points, px or m on the table; None for captures with depth, and where no point was marked."""
+def _annotated_errors(positions: np.ndarray, observations: Observations, *, on_table: bool) -> np.ndarray | None:
+    """Errors of annotated points, px or m on the table; None for captures with depth or without annotated points."""
     image = observations.image
     if image is None or not image.marked.shape[1]:
         return None
     camera = Camera("", image.width, image.height, image.intrinsics, image.camera_to_world)
-    seen = camera, positions, image.marked.astype(np.float64), observations.surface_count
-    return points_on_table(*seen, observations.scenario.up_sign) if on_table else points_in_image(*seen)
+    arguments = camera, positions, image.marked.astype(np.float64), observations.surface_count
+    return points_on_table(*arguments, observations.scenario.up_sign) if on_table else points_in_image(*arguments)
 
 
 _MM: Any = {"unit": "m", "shown_unit": "mm", "factor": 1e3, "digits": 2}
@@ -186,7 +190,7 @@ _DRAWN: Any = {"unit": "1", "of": "pictures", "average": "frames", "in_studies":
 _ALL = (
     Metric(
         name="chamfer", title="Chamfer distance", heading="CD", **_MM, function=chamfer_per_frame, paper_name="cd", in_studies=True,
-        explained="single-directional L1 Chamfer",
+        explained="L1 Chamfer distance in one direction",
     ),
     Metric(
         name="track_error", title="track error", heading="TE", **_MM, paper_name="track_error", in_studies=True,
@@ -195,7 +199,7 @@ _ALL = (
     Metric(
         name="track_error_bound", title="bound track error", heading="TE bound", **_MM, in_studies=True,
         function=lambda positions, seen: bound_track_errors(positions, seen.tracks[: len(positions)]),
-        explained="track error of points bound to the nodes around them, 0 for any rigid motion",
+        explained="track error of points bound to the nodes around them; 0 for every rigid motion",
     ),
     Metric(
         name="psnr", title="PSNR", heading="PSNR", paper_name="psnr", **_DRAWN | {"unit": "dB"}, shown_unit="dB", digits=3,
@@ -214,25 +218,25 @@ _ALL = (
         function="neuspring.scores.pictures:lpips_of",
     ),
     Metric(
-        name="image_error", title="error of marked points in the image", heading="Marked", unit="px", shown_unit="px", digits=1,
-        of="marks", tolerance=1e-3, function=functools.partial(_of_marks, on_table=False),
+        name="image_error", title="error of annotated points in the image", heading="Marked", unit="px", shown_unit="px", digits=1,
+        of="marks", tolerance=1e-3, function=functools.partial(_annotated_errors, on_table=False),
     ),
     Metric(
-        name="table_error", title="error of marked points that lie on the table", heading="On the table", **_MM | {"digits": 1},
-        of="marks", function=functools.partial(_of_marks, on_table=True),
+        name="table_error", title="error of annotated points on the table", heading="On the table", **_MM | {"digits": 1},
+        of="marks", function=functools.partial(_annotated_errors, on_table=True),
     ),
 )  # fmt: skip
 METRICS: Registry[Metric] = Registry("metrics", {metric.name: metric for metric in _ALL}, type=Metric)
-"""By name, in the order of rows of scores and of columns."""
+"""Metrics by name, in the order of table columns."""
 
 
 def metrics_of(of: Of) -> tuple[Metric, ...]:
-    """The metrics of positions, of pictures, or of marked points."""
+    """The metrics of one kind of input: positions, pictures or marks."""
     return tuple(metric for metric in METRICS.values() if metric.of == of)
 
 
 def require_metrics(aims: Iterable[Aim]) -> None:
-    """Raise InputError where an aim names no error, of which alone there are ratios."""
+    """Raise InputError if the metric of an aim is not an error, because ratios exist only for errors."""
     for aim in aims:
         known = [metric.name for metric in METRICS.values() if metric.is_error]
         if aim.metric not in known:
@@ -240,27 +244,27 @@ def require_metrics(aims: Iterable[Aim]) -> None:
 
 
 def errors_per_frame(positions: np.ndarray, observations: Observations, of: Of = "positions") -> dict[str, np.ndarray]:
-    """Every metric of positions (or marks) that applies, per frame [T], by its name; positions [T, N, 3], m."""
-    found = {metric.name: metric.measure(positions, observations) for metric in metrics_of(of)}
-    return {name: values for name, values in found.items() if values is not None}
+    """Values per frame [T] of every applicable metric of positions (or marks), by name; positions are [T, N, 3], m."""
+    measured = {metric.name: metric.measure(positions, observations) for metric in metrics_of(of)}
+    return {name: values for name, values in measured.items() if values is not None}
 
 
 def floors(observations: Observations) -> dict[str, float]:
-    """Metrics of positions in frame 0, m, where the prediction is given: they measure how far points are from nodes, and no motion.
+    """Metrics of positions in frame 0, m: the distance of points from nodes, because frame 0 of a prediction is given.
 
-    Metrics without a value there are left out.
+    Metrics without a value in frame 0 are left out.
     """
     first = errors_per_frame(observations.nodes[None], observations)
     return {name: float(values[0]) for name, values in first.items() if np.isfinite(values[0])}
 
 
 def task_frames(scenario: Scenario, task: str) -> range:
-    """Frames that a task averages over: reconstruction 1..train_end-1, future train_end..T-1 (frame 0 is given)."""
+    """Frames of a task: reconstruction 1..train_end-1 (frame 0 is given), future train_end..T-1."""
     return range(1, scenario.train_end) if task == "reconstruction" else range(scenario.train_end, scenario.frame_count)
 
 
 def last_frame_frozen(trajectory: Trajectory | None, observations: Observations) -> Trajectory:
-    """A trajectory of all frames: where the rollout ended early, its last frame (frame 0 if there is none) stands for the rest."""
+    """Extend a trajectory to all frames by repeating its last frame; an empty trajectory repeats frame 0 of the observations."""
     frames = observations.scenario.frame_count
     empty = trajectory is None or not len(trajectory.positions)
     positions = observations.nodes[None] if trajectory is None or empty else trajectory.positions
@@ -276,10 +280,10 @@ def score(
     errors: Mapping[str, np.ndarray] | None = None,
     tasks: Mapping[str, range] | None = None,
 ) -> pd.DataFrame:
-    """Tidy scores, one row per task and metric; `errors` are `errors_per_frame`, where they are known already.
+    """Scores of a trajectory as a tidy table (`SCORE_COLUMNS`), one row per task and metric.
 
-    `tasks` maps names to the frames that they average over; None: `TASKS`. There is no row, and never NaN, for a task without
-    frames, a metric without annotation, a task that the rollout diverged in.
+    `errors` is the result of `errors_per_frame`, if already computed. `tasks` maps names to frames; None: `TASKS`. A row is left
+    out, never NaN, if the task has no frames, the metric has no annotation, or the rollout diverged within the task.
     """
     scenario = observations.scenario
     rows = []
@@ -297,7 +301,7 @@ def score(
 
 
 def _score_row(scenario: Scenario, method: str, seed: int, task: str, metric: str, values: Any) -> tuple[object, ...]:
-    """`SCORE_COLUMNS` of the values of a metric in the frames of a task."""
+    """One row of `SCORE_COLUMNS`: the mean of a metric's values in the frames of a task."""
     measured = float(values.mean()), METRICS[metric].unit, len(values)
     return scenario.name, scenario.category, method, seed, task, metric, *measured
 
@@ -310,7 +314,7 @@ def score_run(
     seed: int,
     errors: Mapping[str, np.ndarray] | None = None,
 ) -> pd.DataFrame:
-    """Scores of a prediction (`score`) and, where there are any, of its pictures (`score_images`); none without a prediction."""
+    """Scores of a prediction (`score`) and of its images (`score_images`), if any; an empty table without a prediction."""
     import pandas as pd
 
     if trajectory is None:
@@ -323,10 +327,10 @@ def score_run(
 
 
 def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: str, seed: int) -> pd.DataFrame:
-    """Tidy scores of pictures from `frames` (columns frame, camera, metric, value). The prediction has `drawn` frames.
+    """Tidy scores of images from `frames` (columns frame, camera, metric, value); the prediction has `drawn` frames.
 
-    Cameras are averaged within a frame, then frames. A task that the rollout diverged in has no row. The mean leaves out an
-    infinite PSNR, which pictures have that are black on both sides.
+    Cameras are averaged within a frame, then frames. A task without all its frames has no row. Infinite PSNR values are left out;
+    they occur if both images are black.
     """
     rows = []
     frames = frames[np.isfinite(frames["value"])]
@@ -342,12 +346,13 @@ def score_images(frames: pd.DataFrame, scenario: Scenario, drawn: int, method: s
 
 
 def averages(scores: pd.DataFrame) -> pd.DataFrame:
-    """Both averages over scenarios of every method, task and metric.
+    """Average the scores of every method, task and metric over scenarios; seeds are averaged within each scenario first.
 
-    `equal` weighs scenarios equally, `frames` weighs them by their frames.
-    The paper uses the first for distances and the second for pictures: that is `mean`. Seeds are
-    averaged within each scenario first. `seed_std` is the standard deviation over seeds of the equal average, of the seeds
-    that have every scenario: 0 for one seed, NaN where there are several seeds and fewer than two of them have every scenario.
+    - equal: scenarios weighted equally
+    - frames: scenarios weighted by their frames
+    - mean: the paper's choice, `equal` for distances and `frames` for images
+    - seed_std: standard deviation of the equal average over the seeds that have every scenario; 0 for one seed, NaN if fewer than
+      two of several seeds have every scenario
     """
     keys = ["method", "task", "metric"]
     groups = scores.groupby([*keys, "scenario"], sort=False)

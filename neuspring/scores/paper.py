@@ -1,5 +1,4 @@
-"""Printed numbers, as data: the paper's tables, the released PhysTwin's scores; and studies,
-which say which of our methods stands in each row of a table."""
+"""Published numbers as data: the paper's tables and the scores of the released PhysTwin. Studies map table rows to our methods."""
 
 from __future__ import annotations
 
@@ -26,22 +25,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PAPER_TASKS = {"reconstruction": "reconstruction_resimulation", "future": "future_prediction"}
-"""Our tasks to the paper's."""
+"""Our task -> the paper's name of it."""
 MEANS = "MEAN22"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Printed:
-    """A value that the paper prints; lengths in mm, of which the paper prints m."""
+    """A printed value of a table; lengths are converted from the paper's m to mm."""
 
     text: str
     value: float
     slack: float
-    """Half a unit of the last digit: what rounding may have hidden."""
+    """Half a unit of the last printed digit, the uncertainty by rounding."""
 
 
 Values = dict[tuple[str, str, str], Printed]
-"""By label of the row, our task, our metric."""
+"""Printed values by (label of the row, our task, our metric)."""
 
 
 @functools.cache
@@ -52,14 +51,14 @@ def metrics() -> dict[str, Metric]:
 
 
 def in_studies() -> dict[str, Metric]:
-    """The metrics of studies, in the order of their columns: the paper's, then ours."""
+    """The metrics of studies in the order of columns: the paper's, then ours."""
     return metrics() | {name: metric for name, metric in METRICS.items() if metric.in_studies}
 
 
 @functools.cache
 def table(name: str) -> Values:
-    """One of the paper's tables; empty if there is none of that name."""
-    tasks = {theirs: ours for ours, theirs in PAPER_TASKS.items()}
+    """One of the paper's tables by name; empty for an unknown name."""
+    tasks = {name: task for task, name in PAPER_TASKS.items()}
     ours = {metric.paper_name: metric for metric in metrics().values()}
     return {
         (row["method"], tasks[row["task"]], ours[row["metric"]].name): printed(row["value"], ours[row["metric"]].unit == "m")
@@ -74,9 +73,9 @@ def tables() -> tuple[str, ...]:
 
 
 def released_scores() -> Values:
-    """Scores of the released PhysTwin in stored units, by scenario, task, metric.
+    """Scores of the released PhysTwin in stored units, by scenario, task and metric.
 
-    Means over scenarios stand under names that begin with `MEANS`.
+    Keys that start with `MEANS` are means over scenarios.
     """
     names = {"chamfer_distance_m": "chamfer", "track_error_m": "track_error", "train": "reconstruction"}
     return {
@@ -87,7 +86,7 @@ def released_scores() -> Values:
 
 @functools.cache
 def released() -> pd.DataFrame:
-    """Scores of the released PhysTwin: scenario, task, metric, value [m]. 11 of 22 scenarios have scores of training frames."""
+    """Scores of the released PhysTwin: scenario, task, metric, value [m]. Only 11 of 22 scenarios have reconstruction scores."""
     import pandas as pd
 
     rows = [(*key, score.value) for key, score in released_scores().items() if not key[0].startswith(MEANS)]
@@ -96,19 +95,19 @@ def released() -> pd.DataFrame:
 
 @functools.cache
 def scenarios() -> frozenset[str]:
-    """Names of the 22 scenarios that the paper's tables average over."""
+    """Names of the 22 scenarios in the averages of the paper's tables."""
     return frozenset(released()["scenario"])
 
 
 def printed(text: str, in_meters: bool = False) -> Printed:
-    """A printed number with the half unit of its last digit, in mm where it is printed in m."""
+    """Parse a printed number with its rounding; `in_meters` converts m to mm."""
     text = f"{Decimal(text).scaleb(3):f}" if in_meters else text
     digits = len(text.partition(".")[2])
     return Printed(text=text, value=float(text), slack=0.5 * 10.0**-digits)
 
 
 def rows_of(package: str, *path: str) -> list[dict[str, str]]:
-    """Rows of a table (CSV) that ships with a package."""
+    """Rows of a CSV file inside a package."""
     return list(csv.DictReader(resources.files(package).joinpath(*path).read_text(encoding="utf-8").splitlines()))
 
 
@@ -118,26 +117,26 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 Text = Annotated[str, StringConstraints(pattern=r"^[^\n]*\S[^\n]*$")]
 TAKEN = ("summary", "scores", "runs", "perception", "report")
-"""Names of files that other commands write into the folder of tables."""
+"""Reserved names: other commands write files with these names into the same folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A row of studies.yaml: one of the paper's tables, or a table of ours."""
+    """An entry of studies.yaml: one of the paper's tables, or our own table."""
 
     __pydantic_config__ = STRICT
     title: Text
     reference: str | None
-    """Name of the table in paper_tables.csv, or of one of the study's kind; null: nobody published numbers."""
+    """Name of a table in paper_tables.csv, or of a published table of the study's kind; null: no published numbers."""
     baseline: str
-    """Label of the row that the others are compared with, on the same scenarios and seeds."""
+    """Label of the row that all other rows are compared with, on the same scenarios and seeds."""
     rows: dict[Text, Name]
-    """The paper's label to a method of methods.yaml. A label that the paper does not have is shown without its values."""
+    """The paper's label -> a method of methods.yaml. Labels that are not in the paper have no published values."""
 
     training: Text = "equal"
-    """Training of the rows, in words."""
+    """Description of the methods' training, in words."""
     kind: Name | None = None
-    """A kind of study that a package lays out (`STUDY_KINDS`); null: a table of methods like the paper's."""
+    """Kind of study that an extension defines (`STUDY_KINDS`); null: a table of methods like the paper's."""
 
     def __post_init__(self) -> None:
         if self.baseline not in self.rows:
@@ -153,7 +152,7 @@ class Study:
             return
         missing = [label for label in dict.fromkeys(label for label, _, _ in self.values) if label not in self.rows]
         if missing:
-            raise ValueError(f"rows: the paper's {self.reference} also has {missing}; labels must be spelled as there")
+            raise ValueError(f"rows: must contain every label of the paper's {self.reference}; missing: {missing}")
 
     @property
     def values(self) -> Values:
@@ -164,34 +163,34 @@ class Study:
 
 
 class OwnStudy(ABC):
-    """The numbers of a kind of study that a package lays out."""
+    """The numbers of a kind of study that an extension defines."""
 
     published: ClassVar[Mapping[str, Callable[[], Values]]] = {}
-    """Tables of published numbers by name."""
+    """Published tables by name."""
 
     @classmethod
     @abstractmethod
     def of(cls, name: str, study: Study, table: Any, results: Path) -> Self:
-        """Those of a study, from the long table (`scores.table.ScoreTable`) and the results folder."""
+        """Build the numbers of a study from the long table (`scores.table.ScoreTable`) and the results folder."""
 
     @abstractmethod
     def blocks(self) -> list[Any]:
-        """Blocks of neuspring.report.blocks, for the report and the study's files."""
+        """Blocks (neuspring.report.blocks) for the report and the study's files."""
 
     @abstractmethod
     def files(self, folder: Path) -> list[str]:
-        """Write other files into the folder of studies; Markdown lines that show them."""
+        """Write further files into the folder of studies and return the Markdown lines that show them."""
 
 
 STUDY_KINDS: Registry[type[OwnStudy]] = Registry("studies", {}, type)
-"""Kind -> class, from entry points of the group `neuspring.studies`."""
+"""Kind -> class, from the entry point group `neuspring.studies`."""
 
 
 def read_studies(path: Path, extra: Iterable[Path] = ()) -> dict[str, Study]:
-    """The studies of the table, and of files of extra rows, by name. Raises InputError."""
+    """Read the studies of `path` and of the files `extra`, by name. Raises InputError."""
     studies = read_rows(Study, path, "study", extra)
     for name in studies:
         if not SAFE_NAME.fullmatch(name) or name in TAKEN:
-            rule = f"letters, digits, _, . and - make the name of a study, and {', '.join(TAKEN)} are taken"
+            rule = f"a name must consist of letters, digits, _, . and -, and must not be {', '.join(TAKEN)}"
             raise InputError(f"{path}, study {name}", rule, name, "Rename it.")
     return studies

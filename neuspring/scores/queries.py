@@ -10,12 +10,12 @@ from neuspring.scores.metrics import TASKS, averages, present
 from neuspring.scores.table import HELD_TASK, ScoreTable, comparable, stacked
 
 JUDGES = tuple((task, name) for task in ("future", "reconstruction") for name in ("track_error", "chamfer", "image_error"))
-"""Task and metric that decide who is ahead: the first pair that the runs have."""
+"""Pairs of task and metric that rank methods, in order of preference: `duels` uses the first pair that the runs have."""
 CELL_KEYS = ["method", "task", "metric"]
 
 
 def means(table: ScoreTable) -> pd.DataFrame:
-    """`metrics.averages` of every method on the pairs that count; oracles on the same pairs."""
+    """`metrics.averages` of every method on the comparable pairs (`table.comparable`); oracles are averaged on the same pairs."""
     scores = comparable(table.comparison.finished)
     if len(oracles := table.of(table.oracles).finished):
         counted = scores[["scenario", "seed"]].drop_duplicates()
@@ -24,11 +24,15 @@ def means(table: ScoreTable) -> pd.DataFrame:
 
 
 def duels(table: ScoreTable, baseline: str, objects: statistics.Objects = "scenario") -> pd.DataFrame:
-    """Every method against its rival by the error that decides, the best first; empty where nothing can be compared.
+    """Compare every method with its rival by the first error of `JUDGES` that the runs have; best first, empty without one.
 
-    The rival is `baseline` where it has scores, else the best method; its own row has no ratio. Columns: method, rival, task,
-    metric, error (mean over scenarios, stored unit), ratio, ratio_low, ratio_high, n, verdict (`statistics.ratios`); the error is
-    smaller in `better` of `of` scenarios, seeds averaged; `worst` scenario and `worst_error`.
+    The rival is `baseline` if it has scores, else the best method. The row of the rival itself has no rival and no ratio.
+
+    - method, rival, task, metric
+    - error, rival_error: means over the scenarios that all methods finished, stored unit
+    - ratio, ratio_low, ratio_high, n, verdict: as in `statistics.ratios`
+    - better, of: in `better` of `of` scenarios the error is below the rival's, seeds averaged
+    - worst, worst_error: the scenario with the largest error
     """
     finished = table.comparison.finished
     usable = comparable(finished)
@@ -36,7 +40,8 @@ def duels(table: ScoreTable, baseline: str, objects: statistics.Objects = "scena
     key = next((key for key in JUDGES if key in there), None)
     if key is None:
         return pd.DataFrame()
-    usable, finished = (rows[(rows["task"] == key[0]) & (rows["metric"] == key[1])] for rows in (usable, finished))
+    task, metric = key
+    usable, finished = (rows[(rows["task"] == task) & (rows["metric"] == metric)] for rows in (usable, finished))
     order = list(statistics.typical(usable, objects).index)
     rival = baseline if baseline in order else order[0]
     ratios = statistics.ratios(finished, rival, objects).set_index("method")
@@ -45,10 +50,10 @@ def duels(table: ScoreTable, baseline: str, objects: statistics.Objects = "scena
     rows = []
     for method in order:
         both, worst = each[[method, rival]].dropna(), each[method].idxmax()
-        row = {"method": method, "rival": "" if method == rival else rival, "task": key[0], "metric": key[1]}
-        row |= {"error": errors[method], "ratio": np.nan, "ratio_low": np.nan, "ratio_high": np.nan, "n": 0, "verdict": ""}
+        row = {"method": method, "rival": "", "task": task, "metric": metric, "error": errors[method], "n": 0, "verdict": ""}
+        row |= dict.fromkeys(("rival_error", "ratio", "ratio_low", "ratio_high"), np.nan)
         if method != rival:
-            row["verdict"] = statistics.TOO_FEW
+            row |= {"rival": rival, "rival_error": errors[rival], "verdict": statistics.TOO_FEW}
             row |= {"better": int((both[method] < both[rival]).sum()), "of": len(both)}
         if method in ratios.index:
             row |= {name: ratios.loc[method, name] for name in ("ratio", "ratio_low", "ratio_high", "n", "verdict")}
@@ -57,10 +62,10 @@ def duels(table: ScoreTable, baseline: str, objects: statistics.Objects = "scena
 
 
 def with_failures(table: ScoreTable) -> pd.DataFrame:
-    """Means of methods with failed runs: `own` over their successes, `all` over all runs that ended.
+    """Average the methods that have failed runs: column `own` over their successful runs, `all` over all runs that ended.
 
-    A failed run counts with its last finite frame held until the end. `all` is NaN where such a score is missing although other
-    runs of the scenario have the metric.
+    A failed run keeps its last finite frame until the end. `all` is NaN if a run lacks a score although other runs of its scenario
+    have the metric.
     """
     runs = table.runs[table.runs["status"].isin(["ok", "failed"])]
     failed = runs[runs["status"] == "failed"]
@@ -71,15 +76,15 @@ def with_failures(table: ScoreTable) -> pd.DataFrame:
     everything = everything[everything["method"].isin(failed["method"])]
     if not len(everything):
         return pd.DataFrame(columns=[*CELL_KEYS, "own", "all"])
-    found = averages(everything).set_index(CELL_KEYS)["mean"].rename("all").to_frame()
+    result = averages(everything).set_index(CELL_KEYS)["mean"].rename("all").to_frame()
     own = finished[finished["method"].isin(failed["method"])]
-    found["own"] = averages(own).set_index(CELL_KEYS)["mean"] if len(own) else np.nan
+    result["own"] = averages(own).set_index(CELL_KEYS)["mean"] if len(own) else np.nan
     counts, scored = (
         everything.groupby(CELL_KEYS).size(),
         stacked([finished, held]).groupby(["task", "metric"])["scenario"].unique(),
     )
-    for method, task, metric in found.index:
-        wanted = runs[(runs["method"] == method) & runs["scenario"].isin(scored[task, metric])]
-        if counts[method, task, metric] < len(wanted):
-            found.loc[(method, task, metric), "all"] = np.nan
-    return found.reset_index()
+    for method, task, metric in result.index:
+        expected = runs[(runs["method"] == method) & runs["scenario"].isin(scored[task, metric])]
+        if counts[method, task, metric] < len(expected):
+            result.loc[(method, task, metric), "all"] = np.nan
+    return result.reset_index()

@@ -1,4 +1,4 @@
-"""The numbers of a study: for every label, task and metric ours beside the paper's, in the units of tables."""
+"""The numbers of a study: our value and the paper's for every label, task and metric, in the units of tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNCHANGED = dict.fromkeys(("change", "change_low", "change_high", "n"), np.nan)
 
 
 def restricted(study: Study, table: ScoreTable) -> ScoreTable:
-    """The runs of a study's methods, scores in the units of tables."""
+    """The runs of a study's methods, with scores converted to the units of tables."""
     own, known = table.of(list(study.rows.values())), paper.in_studies()
     rows = own.rows[own.rows["metric"].isin(list(known))]
     factors = rows["metric"].map({name: metric.factor for name, metric in known.items()}).astype(float)
@@ -29,12 +29,15 @@ def restricted(study: Study, table: ScoreTable) -> ScoreTable:
 
 
 def cells(study: Study, own: ScoreTable) -> pd.DataFrame:
-    """A row per label, task and metric of the `restricted` table.
+    """One row per label, task and metric of the `restricted` table.
 
-    `paper` is the printed text; `ours` our mean in the paper's average, `spread` its standard deviation over the seeds that have
-    every scenario, `low`, `high` its 95 % bootstrap interval over scenarios and seeds; `verdict` compares ours with the paper.
-    `change` with its interval is the ratio to the baseline, of pictures the difference (`statistics.changes`); `paper_change` is
-    the paper's.
+    - paper: the printed text
+    - ours: our mean, in the paper's average
+    - spread: standard deviation of `ours` over the seeds that have every scenario
+    - low, high: 95 % bootstrap interval of `ours` over scenarios and seeds
+    - verdict: comparison of `ours` with the paper
+    - change, change_low, change_high: ratio to the baseline, for images the difference (`statistics.changes`)
+    - paper_change: the paper's change
     """
     scores = comparable(own.comparison.finished)
     scores = scores[scores["task"].isin(TASKS)]
@@ -48,21 +51,21 @@ def cells(study: Study, own: ScoreTable) -> pd.DataFrame:
     of_paper = own.runs["scenario"].isin(paper.scenarios()) & own.runs["source"].eq("phystwin")
     foreign = set(scores.loc[~scores["run"].isin(own.runs.loc[of_paper, "run"]), "method"])
     status = own.runs.groupby("method")["status"].value_counts().to_dict()
-    there = present(scores) if len(scores) else set()
+    available = present(scores) if len(scores) else set()
     wanted = {key[1:] for key in study.values} or {(task, "chamfer") for task in TASKS}
-    wanted |= there if not study.reference else {key for key in there if key[1] not in paper.metrics()}
+    wanted |= available if not study.reference else {key for key in available if key[1] not in paper.metrics()}
     rows = []
     for label, method in study.rows.items():
         for task, metric in ((task, one) for task in TASKS for one in paper.in_studies().values() if (task, one.name) in wanted):
             key = (method, task, metric.name)
             printed, base = (study.values.get((name, task, metric.name)) for name in (label, study.baseline))
-            found, change = estimated.get(key, NO_ESTIMATE), np.nan
+            estimate, change = estimated.get(key, NO_ESTIMATE), np.nan
             if printed and base and label != study.baseline:
                 change = printed.value / base.value if metric.relative else printed.value - base.value
             row: dict[str, Any] = {"label": label, "method": method, "task": task, "metric": metric.name, "unit": metric.shown_unit}
-            row |= {"average": metric.average, "paper": printed.text if printed else "", **found}
-            row["difference"] = found["ours"] - printed.value if printed and method not in foreign else np.nan
-            row["verdict"] = "oracle" if method in own.oracles else _verdict(found, printed, metric, method in foreign)
+            row |= {"average": metric.average, "paper": printed.text if printed else "", **estimate}
+            row["difference"] = estimate["ours"] - printed.value if printed and method not in foreign else np.nan
+            row["verdict"] = "oracle" if method in own.oracles else _verdict(estimate, printed, metric, method in foreign)
             row |= {"baseline": study.baseline, "paper_change": change, **changed.get(key, UNCHANGED)}
             rows.append(row | {name: status.get((method, name), 0) for name in ("ok", "failed", "missing")})
     return pd.DataFrame(rows)
@@ -79,27 +82,27 @@ def _estimates(scores: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], dic
         part = part.assign(weight=weight, product=weight * part["value"])
         groups = part.groupby(["method", "seed"])
         seeds = groups.agg(total=("product", "sum"), weight=("weight", "sum"), scenarios=("scenario", "nunique"))
-        whole = seeds[seeds["scenarios"] == part["scenario"].nunique()]
-        spread = (whole["total"] / whole["weight"]).groupby(level="method").std(ddof=1)
+        complete = seeds[seeds["scenarios"] == part["scenario"].nunique()]
+        spread = (complete["total"] / complete["weight"]).groupby(level="method").std(ddof=1)
         values = part.pivot(index=["scenario", "seed"], columns="method", values="value")
         weights = part.pivot_table(index="scenario", columns="method", values="weight")[values.columns].to_numpy().T
         runs = [rows.to_numpy().T for _, rows in values.groupby(level="scenario")]
         resampled = resampled_means(runs, np.random.default_rng(0), weights) if len(runs) > 1 else np.empty((len(weights), 0))
         for method, own in zip(map(str, values.columns), resampled, strict=True):
             low, high = interval(own)
-            found = {"ours": float(mean[method, task, name]), "spread": float(spread.get(method, np.nan)), "low": low, "high": high}
-            yield (method, task, name), found | {"scenarios": part["scenario"].nunique()}
+            value = {"ours": float(mean[method, task, name]), "spread": float(spread.get(method, np.nan)), "low": low, "high": high}
+            yield (method, task, name), value | {"scenarios": part["scenario"].nunique()}
 
 
-def _verdict(found: dict[str, Any], printed: Printed | None, metric: Metric, foreign: bool) -> str:
-    """The answer to: is ours the paper's value, within the rounding of the latter? One scenario has no interval but its value."""
-    if np.isnan(found["ours"]):
+def _verdict(estimate: dict[str, Any], printed: Printed | None, metric: Metric, foreign: bool) -> str:
+    """Compare our value with the printed one, within its rounding. One scenario has no interval; its value is compared."""
+    if np.isnan(estimate["ours"]):
         return "not run"
     if printed is None or foreign:
         return "other data" if printed else "not in the paper"
     slack = printed.slack + ROUND_OFF * abs(printed.value)
-    low, high = (found[name] if np.isfinite(found[name]) else found["ours"] for name in ("low", "high"))
-    verdict = "better" if (found["ours"] > printed.value) == (metric.better == "higher") else "worse"
+    low, high = (estimate[name] if np.isfinite(estimate[name]) else estimate["ours"] for name in ("low", "high"))
+    verdict = "better" if (estimate["ours"] > printed.value) == (metric.better == "higher") else "worse"
     verdict = "within" if low - slack <= printed.value <= high + slack else verdict
-    counted, everyone = found["scenarios"], len(paper.scenarios())
-    return verdict if counted >= everyone else f"partial ({counted} of {everyone}): {verdict}"
+    counted, total = estimate["scenarios"], len(paper.scenarios())
+    return verdict if counted >= total else f"partial ({counted} of {total}): {verdict}"

@@ -1,12 +1,12 @@
-"""The long table of a benchmark: a row per run, task, metric (or stage), with frames, value and unit.
+"""The long table of a benchmark: one row per run, task and metric (or stage), with frames, value and unit.
 
 All tables of the report, of studies and of README pages are queries on it. It is read from the records of a results folder, or from
-the scores.csv and runs.csv that `neuspring tables` wrote. Tasks of its rows:
+scores.csv and runs.csv of `neuspring tables`. Tasks:
 
 - reconstruction, future: scores of finished and failed runs; transfer: means over other recordings of the same object.
-- reconstruction_held, future_held: scores of a failed run whose last finite frame stands until the end.
+- reconstruction_held, future_held: scores of a failed run that keeps its last finite frame until the end.
 - start: errors in frame 0, where the prediction is given.
-- time [s], memory [MB], epochs, converged (0 or 1): costs; the metric is the stage.
+- time [s], memory [MB], epochs, converged (0 or 1): cost; the metric is the stage.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ RUN_COLUMNS = (
 )
 RUN_KEYS = ["scenario", "method", "seed"]
 DAMAGED = "damaged record: "
-"""Begin of the reason of a run whose files cannot be read."""
+"""Start of the reason of a run with unreadable files."""
 PREDICTING_STAGES = ("search", "fit", "train", "rollout")
-"""Stages whose settings make a prediction."""
+"""Stages whose settings affect a prediction."""
 NOT_SETTINGS = ("seed", "device", "description", "batch")
 LeftOut = Mapping[str, Mapping[str, str]]
-"""Method -> scenarios to which it does not apply -> reason."""
+"""Method -> scenario to which it does not apply -> reason."""
 EMPTY_MAP: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """The long table (`TABLE_COLUMNS`), and one row per run (`RUN_COLUMNS`) with its status: ok, failed or missing."""
+    """The long table `rows` (`TABLE_COLUMNS`) and one row per run in `runs` (`RUN_COLUMNS`), with status ok, failed or missing."""
 
     rows: pd.DataFrame
     runs: pd.DataFrame
     left_out: LeftOut = field(default_factory=dict)
     records: Mapping[tuple[str, str, int], RunRecord] = field(default_factory=dict)
-    """Records by scenario, method, seed; empty for a table read from scores.csv."""
+    """Records by (scenario, method, seed); empty for a table from scores.csv."""
 
     def of(self, methods: Collection[str]) -> ScoreTable:
         """The runs of these methods."""
@@ -72,25 +72,25 @@ class ScoreTable:
         left_out = {name: where for name, where in self.left_out.items() if name in methods}
         return ScoreTable(rows, runs, left_out, {key: record for key, record in self.records.items() if key[1] in methods})
 
-    def named(self, **wanted: Collection[str | int]) -> ScoreTable:
-        """The runs of these `scenario`s, `method`s and `seed`s; all where none is named. Raises InputError for an absent name."""
+    def named(self, **selected: Collection[str | int]) -> ScoreTable:
+        """Select runs by `scenario`, `method` and `seed`; an empty list selects all. Raises InputError for an unknown name."""
         rows, runs = self.rows, self.runs
-        for column, names in wanted.items():
+        for column, names in selected.items():
             known = dict.fromkeys(self.runs[column])
             if absent := [name for name in names if name not in known]:
-                raise InputError(f"--{column}s", "must be in the file of --scores", listed(absent), f"There: {listed(known, 40)}.")
+                raise InputError(f"--{column}s", "must be in the file of --scores", listed(absent), f"Known: {listed(known, 40)}.")
             if names:
                 rows, runs = (table[table[column].isin(list(names))] for table in (rows, runs))
         return replace(self, rows=rows, runs=runs)
 
     @property
     def methods(self) -> list[str]:
-        """Methods in order."""
+        """Methods in the order of the runs."""
         return list(dict.fromkeys(self.runs["method"]))
 
     @property
     def oracles(self) -> list[str]:
-        """Methods that were fitted on all frames; they take no part in comparisons."""
+        """Methods that are fitted on all frames; comparisons exclude them."""
         return list(dict.fromkeys(self.runs.loc[self.runs["oracle"].astype(bool), "method"]))
 
     @property
@@ -115,10 +115,10 @@ class ScoreTable:
 
 
 def comparable(scores: pd.DataFrame) -> pd.DataFrame:
-    """The scores on which averages compare like with like.
+    """The scores on which averages of methods can be compared.
 
-    Kept are pairs of scenario and seed that every method finished, and of each metric the pairs that every method with this metric
-    has. A method without a finished run takes no part. Transfers are compared among themselves.
+    Keeps the pairs of scenario and seed that every method finished, and per metric those that every method with this metric has.
+    Methods without a finished run are ignored. Transfers are filtered separately.
     """
     parts = []
     for _, part in scores.groupby(scores["task"].eq(TRANSFER), sort=False):
@@ -127,12 +127,12 @@ def comparable(scores: pd.DataFrame) -> pd.DataFrame:
     kept = stacked(parts)
     if not len(kept):
         return kept
-    here = kept.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
-    return kept[here == kept.groupby(["task", "metric"])["method"].transform("nunique")]
+    methods = kept.groupby(["task", "metric", "scenario", "seed"])["method"].transform("nunique")
+    return kept[methods == kept.groupby(["task", "metric"])["method"].transform("nunique")]
 
 
 def stacked(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """One long table of several; empty ones carry no column types and are left out."""
+    """Concatenate long tables; empty tables are skipped, because they have no column types."""
     filled = [table for table in tables if len(table)]
     return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=list(TABLE_COLUMNS))
 
@@ -147,7 +147,7 @@ def collect(
 ) -> ScoreTable:
     """Read the records of every scenario, method and seed, and the transfers of the scenarios `transfers`.
 
-    A run without a record is missing, one with a damaged record failed. A method has no run on a scenario that `left_out` names.
+    The status is missing without a record, failed with a damaged record. Pairs of method and scenario in `left_out` have no run.
     """
     scenarios, methods, seeds = tuple(scenarios), tuple(methods), tuple(seeds)
     tables, rows, records = [], [], {}
@@ -169,10 +169,10 @@ def collect(
         records[scenario, method, seed] = record
         row |= {name: getattr(record, name) for name in ("status", "reason", "source", "run_key", "oracle")}
         row |= {"notes": "; ".join(record.notes), "images": json.dumps(record.images), "settings": settings_of(record)}
-    moved, ended = read_transfers(results, transfers, methods, seeds)
-    if len(moved):
+    transferred, ended = read_transfers(results, transfers, methods, seeds)
+    if len(transferred):
         keys = ["source", "category", "method", "seed", "task", "metric", "unit"]
-        kept = moved.merge(ended.loc[ended["status"] == "ok", RUN_KEYS].rename(columns={"scenario": "source"}))
+        kept = transferred.merge(ended.loc[ended["status"] == "ok", RUN_KEYS].rename(columns={"scenario": "source"}))
         mean = kept.groupby(keys, sort=False).agg(value=("value", "mean"), frames=("frames", "sum")).reset_index()
         tables.append(_with_run(mean.rename(columns={"source": "scenario"})))
     failed = ended[ended["status"] != "ok"].set_index(RUN_KEYS)["reason"].to_dict()
@@ -183,9 +183,9 @@ def collect(
     for row in rows:
         own = row.get("settings", {})
         row["settings"] = json.dumps({name: own[name] for name in varied if name in own})
-    absent = {name: {where: why for where, why in places.items() if where in scenarios} for name, places in left_out.items()}
-    absent = {name: where for name, where in absent.items() if name in methods and where}
-    return ScoreTable(stacked(tables), _filled(pd.DataFrame(rows, columns=list(RUN_COLUMNS))), absent, records)
+    inapplicable = {name: {where: why for where, why in own.items() if where in scenarios} for name, own in left_out.items()}
+    inapplicable = {name: where for name, where in inapplicable.items() if name in methods and where}
+    return ScoreTable(stacked(tables), _filled(pd.DataFrame(rows, columns=list(RUN_COLUMNS))), inapplicable, records)
 
 
 def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
@@ -205,7 +205,7 @@ def _rows_of(record: RunRecord, folder: Path) -> pd.DataFrame:
 
 
 def _named(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows with the names of their runs."""
+    """Rows with a column `run`."""
     return rows.assign(run=rows["scenario"] + "/" + rows["method"] + "/" + rows["seed"].astype(str))
 
 
@@ -214,14 +214,14 @@ def _with_run(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _filled(runs: pd.DataFrame) -> pd.DataFrame:
-    """No gaps in `RUN_COLUMNS`; a run without a record is an oracle as the others of its method are."""
+    """Fill missing values of `RUN_COLUMNS`; a run without a record is an oracle if another run of its method is."""
     oracles = runs.loc[runs["oracle"].astype(str).eq("True"), "method"]
     texts = dict.fromkeys(("reason", "notes", "source", "run_key"), "") | {"images": "null", "settings": "{}"}
     return runs.fillna(texts).assign(oracle=runs["method"].isin(oracles))
 
 
 def settings_of(record: RunRecord) -> dict[str, Any]:
-    """The settings of all stages under dotted names; a section named like its stage is not named twice."""
+    """The settings of all stages under dotted names; a section with the name of its stage is not repeated in them."""
     named = {"stages": " + ".join(name for name in PREDICTING_STAGES if name in record.settings)}
     for stage, settings in record.settings.items():
         values = {name.removeprefix(f"{stage}."): value for name, value in flat(settings).items()}
@@ -230,7 +230,7 @@ def settings_of(record: RunRecord) -> dict[str, Any]:
 
 
 def _varied(settings: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Names of the settings that are not the same in all runs that have them, sorted."""
+    """Sorted names of the settings that differ between runs."""
     values: dict[str, set[str]] = {}
     for own in settings:
         for name, value in own.items():
@@ -239,33 +239,33 @@ def _varied(settings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def recorded(runs: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
-    """Setting of predictions -> method -> the values that its runs recorded, sorted."""
-    found: dict[str, dict[str, set[str]]] = {}
+    """Setting that affects predictions -> method -> the sorted values in its runs' records."""
+    values_of: dict[str, dict[str, set[str]]] = {}
     for method, text in set(zip(runs["method"], runs["settings"], strict=True)):
         for name, value in json.loads(text).items():
             if name.split(".")[0] in (*PREDICTING_STAGES, "stages", "method"):
                 shown = value if isinstance(value, str) else json.dumps(value)
-                found.setdefault(name, {}).setdefault(method, set()).add(shown)
-    return {name: {method: sorted(values) for method, values in own.items()} for name, own in sorted(found.items())}
+                values_of.setdefault(name, {}).setdefault(method, set()).add(shown)
+    return {name: {method: sorted(values) for method, values in own.items()} for name, own in sorted(values_of.items())}
 
 
 def differing(runs: pd.DataFrame) -> dict[str, dict[str, str]]:
-    """Settings that differ between methods: setting -> method -> its value, or values joined by "or"."""
+    """Settings that differ between methods: setting -> method -> its value, or several joined by "or"."""
     joined = {name: {method: " or ".join(values) for method, values in own.items()} for name, own in recorded(runs).items()}
     return {name: own for name, own in joined.items() if len(set(own.values())) > 1}
 
 
 def mixed_settings(runs: pd.DataFrame) -> list[str]:
-    """`stage of method` wherever finished runs of one method were made with different settings."""
-    found = recorded(runs[runs["status"] == "ok"])
+    """`stage of method` for every method whose finished runs have different settings."""
+    by_setting = recorded(runs[runs["status"] == "ok"])
     mixed = [
-        f"{name.split('.')[0]} of {method}" for name, own in found.items() for method, values in own.items() if len(values) > 1
+        f"{name.split('.')[0]} of {method}" for name, own in by_setting.items() for method, values in own.items() if len(values) > 1
     ]
     return list(dict.fromkeys(mixed))
 
 
 def as_asked(table: ScoreTable, asked: Mapping[str, Any]) -> ScoreTable:
-    """The table without runs that are missing because the last workflow run asked for a part (`only=...`)."""
+    """Drop missing runs outside of the last workflow run's selection (`only=...`)."""
     if not asked.get("only"):
         return table
     inside = [table.runs[name].isin(asked.get(f"{name}s", [])) for name in RUN_KEYS]
@@ -278,20 +278,20 @@ def one_line(error: Exception) -> str:
 
 
 def read_scores(path: Path) -> ScoreTable:
-    """The table of a scores.csv; the runs.csv beside it says how runs ended. Raises InputError.
+    """Read scores.csv, and the status of runs from runs.csv in the same folder. Raises InputError.
 
-    Without runs.csv every run counts as finished.
+    Without runs.csv, every run counts as finished.
     """
     try:
         rows = pd.read_csv(path)
         rows = _with_run(rows[list(SCORE_COLUMNS)].astype({"value": float, "seed": int}))
     except (OSError, ValueError, KeyError) as error:
         rule = f"must be a scores.csv with the columns {', '.join(SCORE_COLUMNS)}"
-        remedy = "Run the command that made it again (fits are reused), or take the file from a folder of tables."
+        remedy = "Rerun the command that wrote it (fits are reused), or name scores.csv of another folder of tables."
         raise InputError(path, rule, one_line(error), remedy) from error
-    beside = path.with_name("runs.csv")
-    if beside.is_file():
-        runs = _named(pd.read_csv(beside))
+    status = path.with_name("runs.csv")
+    if status.is_file():
+        runs = _named(pd.read_csv(status))
     else:
         runs = rows[["run", *RUN_KEYS]].drop_duplicates(ignore_index=True).assign(status="ok", source=path.name)
     return ScoreTable(rows, _filled(runs.reindex(columns=list(RUN_COLUMNS))))
@@ -300,7 +300,7 @@ def read_scores(path: Path) -> ScoreTable:
 def read_transfers(
     results: Path, sources: Iterable[str], methods: Iterable[str], seeds: Iterable[int]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Scores of transferred twins on each target, with the column `source`; and a row per source, method and seed with a record."""
+    """Scores of transferred twins on each target (column `source`), and one row per source, method and seed with its status."""
     tables, rows = [], []
     for scenario, method, seed in product(sources, methods, seeds):
         path = Path(results) / scenario / method / str(seed) / "transfer.json"
@@ -321,10 +321,10 @@ def read_transfers(
 
 
 def pairs(table: pd.DataFrame) -> int:
-    """Number of pairs of scenario and seed."""
+    """The number of pairs of scenario and seed."""
     return len(table[["scenario", "seed"]].drop_duplicates())
 
 
 def of_kind(rows: pd.DataFrame, *kinds: str) -> pd.DataFrame:
-    """Rows of metrics of positions, pictures or marks."""
+    """Rows of the metrics of these kinds (`metrics.Of`): positions, pictures, marks."""
     return rows[rows["metric"].isin([name for name, metric in METRICS.items() if metric.of in kinds])]

@@ -1,16 +1,16 @@
-"""Lists of ellipses per tile, and their front-to-back blending, differentiable: Warp kernels, the same on CPU and CUDA.
+"""Lists of ellipses per tile and their differentiable front-to-back blending, in Warp kernels for CPU and CUDA.
 
-For a pixel at u and the ellipses i of its tile in order of depth, with conic Q_i, mean m_i, opacity o_i and feature f_i [4],
+A pixel at u blends the ellipses i of its tile in order of depth, with conic Q_i, mean m_i, opacity o_i and feature f_i [4]:
 
-    s_i = (u - m_i)^T Q_i (u - m_i) / 2,   a_i = min(alpha_max, o_i exp(-s_i)),   w_i = a_i T_i,   T_(i+1) = T_i (1 - a_i),
+    s_i = (u - m_i)^T Q_i (u - m_i) / 2,   a_i = min(alpha_max, o_i exp(-s_i)),   w_i = a_i T_i,   T_(i+1) = T_i (1 - a_i)
 
-gives F = sum_i w_i f_i and T. Ellipses with a_i < alpha_min are skipped; the pixel is done before the first one that would leave
-T <= transmittance_min. The adjoint goes back to front and takes T_i = T_(i+1) / (1 - a_i) from the end, with B_i = sum_(j>i) w_j
-(f_j . dL/dF) + T dL/dT:
+The result is F = sum_i w_i f_i and the final transmittance T. Ellipses with a_i < alpha_min are skipped. Blending stops before
+the first ellipse that would leave T <= transmittance_min. The adjoint runs from back to front, with T_i = T_(i+1) / (1 - a_i)
+and B_i = sum_(j>i) w_j (f_j . dL/dF) + T dL/dT:
 
     dL/da_i = T_i (f_i . dL/dF) - B_i / (1 - a_i),   dL/ds_i = -o_i exp(-s_i) dL/da_i,   both zero where a_i is clamped.
 """
-# No postponed annotations here: Warp reads the evaluated types of the closures below.
+# This module does not postpone annotations: Warp reads the evaluated types of the closures below.
 
 import functools
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from neuspring.core.device import load, start_warp
 from neuspring.splats.view import Limits, View
 
 TILE_SIDE = {"cpu": 8, "cuda": 16}
-"""Pixels. A pixel's thread looks at all ellipses of its tile: small tiles make many lists, large tiles many looks in vain."""
+"""Side of a tile, px. A pixel's thread visits all ellipses of its tile: small tiles make many lists, large tiles many misses."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ class Tiles:
     side: int
     across: int
     starts: torch.Tensor
-    """[tiles + 1] int32: where each tile's list begins."""
+    """Start of each tile's list [tiles + 1], int32."""
     members: torch.Tensor
-    """[total] int32: ellipses, nearest first within a tile."""
+    """Ellipses [total], int32; nearest first within a tile."""
 
 
 @torch.no_grad()
 def tiles(depths: torch.Tensor, boxes: torch.Tensor, view: View) -> Tiles:
-    """Lists for ellipses with depths [M] and boxes [M, 4], all of which touch the picture. Equal depths keep their order."""
+    """Lists of ellipses with depths [M] and boxes [M, 4]; all must touch the image. Equal depths keep their order."""
     device = depths.device
     side = TILE_SIDE[device.type]
     across, down = -(-view.width // side), -(-view.height // side)
@@ -48,7 +48,7 @@ def tiles(depths: torch.Tensor, boxes: torch.Tensor, view: View) -> Tiles:
     low = torch.div(boxes[order, :2], side, rounding_mode="floor")
     span = torch.div(boxes[order, 2:] - 1, side, rounding_mode="floor") - low + 1
     counts = (span[:, 0] * span[:, 1]).long()
-    # One entry per ellipse and tile that it touches, still in order of depth; a stable sort by tile keeps that order in each list.
+    # One entry per ellipse and touched tile, in order of depth; the stable sort by tile keeps this order within each list.
     owner = torch.repeat_interleave(torch.arange(len(order), device=device), counts)
     inside = torch.arange(len(owner), device=device) - (torch.cumsum(counts, 0) - counts)[owner]
     wide = span[owner, 0].long()
@@ -67,8 +67,10 @@ def blend(
     opacities: torch.Tensor,
     features: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Blended features [H, W, 4] and transmittance [H, W], differentiable in means [M, 2], conics [M, 3], opacities [M],
-    features [M, 4]."""
+    """Blended features [H, W, 4] and transmittance [H, W].
+
+    Differentiable in means [M, 2], conics [M, 3], opacities [M] and features [M, 4].
+    """
     start_warp()
     result: tuple[torch.Tensor, torch.Tensor] = _Blend.apply(lists, view, limits, means, conics, opacities, features)  # type: ignore[no-untyped-call]
     return result
@@ -80,7 +82,7 @@ class _Blend(torch.autograd.Function):
         ctx: Any, lists: Tiles, view: View, limits: Limits, *tensors: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         means, conics, opacities, features = tensors
-        # Beyond this exponent an ellipse is below alpha_min; the comparison saves most exponentials.
+        # Above this exponent an ellipse is below alpha_min: the comparison avoids most exponentials.
         bound = torch.log(opacities / limits.alpha_min) * (1 + 1e-6) + 1e-6
         strengths = torch.stack([opacities, bound], dim=1)
         inputs = [t.detach().contiguous() for t in (means, conics, strengths, features)]
@@ -108,10 +110,10 @@ class _Blend(torch.autograd.Function):
 
 
 def _launch(which: int, view: View, arguments: list[Any], like: torch.Tensor) -> None:
-    """Run kernel `which` of `kernels`, a thread per pixel, in the precision and on the device of `like`."""
+    """Run kernel `which` of `kernels` with one thread per pixel, in the precision and on the device of `like`."""
     device = wp.device_from_torch(like.device)
     kernel = load(kernels(wp.dtype_from_torch(like.dtype))[which], device)
-    # Torch orders its own work on its current stream, so the kernel must run there too.
+    # Torch orders its own work on its current stream, so the kernel must run on it too.
     stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
     wp.launch(kernel, (view.height, view.width), arguments, device=device, stream=stream)
 
@@ -125,13 +127,13 @@ def _scalars(*tensors: torch.Tensor) -> list[Any]:
 
 
 def _vectors(*tensors: torch.Tensor) -> list[Any]:
-    """Warp arrays of the same memory whose entries are vectors: the last axis."""
+    """Warp arrays that share the tensors' memory; the last axis becomes a vector."""
     return [wp.from_torch(t, dtype=wp.types.vector(t.shape[-1], wp.dtype_from_torch(t.dtype))) for t in tensors]
 
 
 @functools.cache
 def kernels(real: Any) -> tuple[Any, Any]:
-    """The kernels (blending, its adjoint) for the scalar type `real`, wp.float32 or wp.float64."""
+    """The kernels (blending and its adjoint) for the scalar type `real`, wp.float32 or wp.float64."""
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -157,7 +159,7 @@ def kernels(real: Any) -> tuple[Any, Any]:
         y, x = wp.tid()  # type: ignore[misc]
         place = vec2(real(x) + half, real(y) + half)
         number = (y // tile) * across + x // tile
-        # Both begin as the caller left them: zero and one.
+        # The caller initialized both: zero and one.
         sum = total[y, x]
         left = transmittance[y, x]
         end = starts[number]

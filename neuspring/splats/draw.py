@@ -1,4 +1,4 @@
-"""Pictures of a twin: its splats in every frame of a trajectory, seen by any camera, RGBA over any background."""
+"""Images of a twin: its splats in every frame of a trajectory, from any camera, as RGBA over any background."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from neuspring.splats.skinning import Skin
 from neuspring.splats.view import View, rotations, turned_harmonics
 
 OBJECT_COVERAGE = 128
-"""Coverage, of 255, from which a pixel counts as object: a half."""
+"""A pixel is part of the object from this coverage (of 255): one half."""
 LEAST_OPACITY = 0.1
-"""A splat must exceed it to be drawn when the twin moves, as released."""
+"""Splats of a moving twin are rendered above this opacity. The value is that of PhysTwin's release."""
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
@@ -29,7 +29,7 @@ def view_of(camera: Camera, device: str) -> View:
 
 
 def prune_by_opacity(splats: Splats) -> Splats:
-    """Splats that are opaque enough to be moved. Raises NumericalFailure where none is."""
+    """Keep the splats whose opacity exceeds `LEAST_OPACITY`. Raises NumericalFailure if none does."""
     dense = 1 / (1 + np.exp(-splats.opacity_logits)) > LEAST_OPACITY
     if not dense.any():
         raise NumericalFailure(f"appearance: no splat has an opacity above {LEAST_OPACITY}")
@@ -37,7 +37,7 @@ def prune_by_opacity(splats: Splats) -> Splats:
 
 
 def skinned_frames(splats: Splats, positions: np.ndarray, device: str) -> Iterator[Gaussians]:
-    """The splats in every frame of a trajectory [F, N, 3], m; colors that depend on the direction turn with them."""
+    """Yield the splats in every frame of a trajectory [F, N, 3], m. Colors that depend on direction rotate with the splats."""
     start = Gaussians.of(splats, device)
     unturned = rotations(start.quaternions).mT
     skin = Skin(positions[0], device=device)
@@ -49,25 +49,25 @@ def skinned_frames(splats: Splats, positions: np.ndarray, device: str) -> Iterat
 
 
 def frames_from_centers(splats: Splats, centers: np.ndarray, device: str) -> Iterator[Gaussians]:
-    """The splats with the centers [F, G, 3], m, in every frame; their orientations stay."""
+    """Yield the splats with the centers [F, G, 3], m, of every frame; their orientations do not change."""
     start = Gaussians.of(splats, device)
     if centers.shape[1] != len(splats.means):
         rule = f"one center for each of {len(splats.means)} splats is required"
-        raise InputError("splat centers", rule, centers.shape[1], "Splats and rollout must be of the same method and seed.")
+        raise InputError("splat centers", rule, centers.shape[1], "Give splats and rollout of the same method and seed.")
     for means in torch.tensor(centers, device=device):
         yield replace(start, means=means)
 
 
 @torch.no_grad()
 def picture(gaussians: Gaussians, view: View, backend: Backend, background: tuple[float, float, float] = BLACK) -> np.ndarray:
-    """RGBA [H, W, 4] uint8: color over the background, and coverage."""
+    """Render RGBA [H, W, 4] uint8: color over the background, and coverage."""
     drawn = gaussians.draw(view, background=background, backend=backend)
     rgba = torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1).clamp(0, 1)
     return (255 * rgba + 0.5).floor().to(torch.uint8).cpu().numpy()
 
 
 def orbit_view(gaussians: Gaussians, like: View, backend: Backend, angle: float) -> np.ndarray:
-    """RGB [H, W, 3] uint8 over white: the view `like`, turned about the object by `angle` degrees."""
+    """Render RGB [H, W, 3] uint8 over white: the view `like`, rotated about the object by `angle` degrees."""
     center = gaussians.means.median(0).values.double().cpu().numpy()
     turn = Rotation.from_euler("z", angle, degrees=True)
     pose = np.linalg.inv(like.world_to_camera.double().cpu().numpy())

@@ -1,15 +1,15 @@
-"""SSIM of pictures, and what training of splats minimizes, on one view of frame 0.
+"""SSIM of images, and the loss that the training of splats minimizes on one view of frame 0.
 
     L = 0.8 |C - C*| + dssim (1 - SSIM(C, C*)) + mask |A - M| + depth |D - D*|
 
-C color, A coverage, D expected depth of the picture; C* the image on black outside the object's mask M; D* depth measured on the
-object. Means are over all pixels. What hands hide is not compared: there everything is zero on both sides.
+C, A and D are the rendered color, coverage and expected depth. C* is the image, black outside the object's mask M; D* is the
+depth measured on the object. Means are over all pixels. Pixels behind hands are zero on both sides, so they are not compared.
 
-SSIM (Wang et al. 2004) of a and b, with means, variances and covariance under a Gaussian window (11x11, sigma 1.5), per channel:
-(2 mu_a mu_b + C1)(2 sigma_ab + C2) / ((mu_a^2 + mu_b^2 + C1)(sigma_a^2 + sigma_b^2 + C2)), C1 = 0.01^2, C2 = 0.03^2, data range 1.
-With s = a + b and d = a - b: 4 mu_a mu_b = mu_s^2 - mu_d^2, 2 (mu_a^2 + mu_b^2) = mu_s^2 + mu_d^2, and so for the variances.
-Outside the picture everything is zero, as in the released code of Gaussian splatting and PhysTwin.
-Pictures are [..., C, H, W], float32 or float64 in [0, 1]. Bad shapes and types raise InputError.
+SSIM of a and b (Wang et al. 2004) per channel, with means, variances and covariance under a Gaussian window (11x11, sigma 1.5):
+(2 mu_a mu_b + C1)(2 sigma_ab + C2) / ((mu_a^2 + mu_b^2 + C1)(sigma_a^2 + sigma_b^2 + C2)), C1 = 0.01^2, C2 = 0.03^2, range 1.
+With s = a + b and d = a - b: 4 mu_a mu_b = mu_s^2 - mu_d^2, 2 (mu_a^2 + mu_b^2) = mu_s^2 + mu_d^2; the same holds for variances.
+Images are padded with zeros, as in the released code of Gaussian splatting and PhysTwin.
+Images are [..., C, H, W], float32 or float64 in [0, 1]. Wrong shapes and types raise InputError.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from neuspring.splats.rasterize import Rendered
 from neuspring.splats.view import View
 
 WINDOW_RADIUS = 5
-"""px: the window is 2 WINDOW_RADIUS + 1 wide."""
+"""The window is 2 WINDOW_RADIUS + 1 px wide."""
 SIGMA = 1.5
-"""px."""
+"""Standard deviation of the window, px."""
 C1 = 0.01**2
 C2 = 0.03**2
 COLOR_WEIGHT = 0.8
-"""Weight of the mean absolute difference of colors, as released."""
+"""Weight of the mean absolute color difference, as in PhysTwin's release."""
 HAND_MARGIN, REFERENCE_WIDTH = 8.0, 848
-"""Hands are dilated by a square of so many pixels in an image of this width; pixels within are not compared."""
+"""Side of the square that dilates masks of hands, px, and the image width that it refers to; pixels within are not compared."""
 SSIM_MARGIN = 12
-"""Pixels around the object's mask in which SSIM is taken; its window is 11 wide. Splats farther out cost color and mask alone."""
+"""Margin around the object's mask in which SSIM counts, px; its window is 11 px wide. Farther out only color and mask count."""
 
 
 def check_pair(where: str, a: torch.Tensor, b: torch.Tensor) -> None:
-    """Raise InputError, naming `where`, for pictures that cannot be compared."""
+    """Raise InputError, naming `where`, for images that cannot be compared."""
     if a.ndim < 3 or a.shape != b.shape:
-        raise InputError(where, "two pictures [..., C, H, W] of the same shape are needed", f"{tuple(a.shape)}, {tuple(b.shape)}")
+        raise InputError(where, "two images [..., C, H, W] of the same shape are required", f"{tuple(a.shape)}, {tuple(b.shape)}")
     if a.dtype != b.dtype or a.dtype not in (torch.float32, torch.float64):
-        raise InputError(where, "both pictures must be float32 or both float64", f"{a.dtype}, {b.dtype}")
+        raise InputError(where, "both images must be float32, or both float64", f"{a.dtype}, {b.dtype}")
 
 
 def _blur(pictures: torch.Tensor) -> torch.Tensor:
-    """Mean of every [H, W] plane under the Gaussian window, zeros outside: rows, then columns."""
+    """Mean of every [H, W] plane under the Gaussian window with zero padding: rows, then columns."""
     offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, device=pictures.device, dtype=torch.float64)
     window = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
     window = (window / window.sum()).to(pictures.dtype)
-    # One call with a group per plane: much faster on CPU than a batch of one-channel pictures.
+    # On CPU one call with a group per plane is much faster than a batch of one-channel images.
     planes = pictures.reshape(1, -1, *pictures.shape[-2:])
     groups = planes.shape[1]
     planes = conv2d(planes, window.expand(groups, 1, 1, -1), padding=(0, WINDOW_RADIUS), groups=groups)
@@ -64,8 +64,8 @@ def _blur(pictures: torch.Tensor) -> torch.Tensor:
 def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """SSIM at every pixel and channel [..., C, H, W]; differentiable."""
     check_pair("ssim", a, b)
-    # In sum and difference the formula needs four means instead of five, and keeps its digits in single precision: the rounding
-    # of the large variance, that of the sum, cancels between numerator and denominator.
+    # With sum and difference the formula needs four means instead of five. It is also accurate in single precision: the rounding
+    # error of the large variance (of the sum) cancels between numerator and denominator.
     total, difference = a + b, a - b
     mean_total, mean_difference, total_squared, difference_squared = _blur(
         torch.stack((total, difference, total * total, difference * difference))
@@ -77,24 +77,24 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """SSIM: the mean of its map; differentiable. 1 for equal pictures, less for all others."""
+    """Mean SSIM of two images; differentiable. It is 1 for equal images and less otherwise."""
     return ssim_map(a, b).mean()
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One camera's picture of frame 0, masked, on a device."""
+    """The masked image of one camera in frame 0, on a device."""
 
     name: str
     view: View
     color: torch.Tensor
-    """[H, W, 3] in 0..1, black outside the object's mask."""
+    """Color [H, W, 3] in 0..1, black outside the object's mask."""
     mask: torch.Tensor
-    """[H, W] 1 where the object is seen."""
+    """1 where the object is visible, else 0 [H, W]."""
     known: torch.Tensor
-    """[H, W] 0 behind hands, else 1."""
+    """0 behind hands, else 1 [H, W]."""
     depth: torch.Tensor
-    """[H, W] m, 0 where the object's depth was not measured."""
+    """Depth [H, W], m; 0 outside the object and where it was not measured."""
     box: tuple[int, int, int, int]
     """Rows and columns around the mask: top, bottom, left, right, ends excluded."""
 
@@ -102,9 +102,9 @@ class Shot:
     def of(
         cls, name: str, view: View, color: np.ndarray, mask: np.ndarray, hands: np.ndarray, depth: np.ndarray, margin: float
     ) -> Shot | None:
-        """Shot of an image [H, W, 3] uint8, bool masks [H, W], depth [H, W] m; hands are dilated by a square of `margin` pixels.
+        """Shot of an image [H, W, 3] uint8, bool masks [H, W] and depth [H, W], m; None if the object is not visible.
 
-        None where nothing of the object is seen. Raises InputError for sizes that differ from the view's.
+        Hands are dilated by a square of `margin` pixels. Raises InputError for sizes that differ from the view's.
         """
         size = (view.height, view.width)
         for what, array in {"image": color, "mask": mask, "mask of hands": hands, "depth": depth}.items():
@@ -132,13 +132,13 @@ class Shot:
 
     @property
     def pixel_width(self) -> float:
-        """Width of a pixel at the object, m; NaN where no depth was measured on it."""
+        """Width of a pixel at the object, m; NaN if no depth was measured on the object."""
         measured = self.depth[self.depth > 0]
         return float(measured.median() / self.view.intrinsics[0, 0]) if len(measured) else float("nan")
 
 
 def loss(rendered: Rendered, shot: Shot, settings: Appearance) -> torch.Tensor:
-    """The training loss of one picture."""
+    """The training loss of one rendered image."""
     color = rendered.rgb * shot.known[..., None]
     total = COLOR_WEIGHT * (color - shot.color).abs().mean()
     if settings.dssim:

@@ -1,4 +1,4 @@
-"""Gaussian splats as a noun: stored in the PLY layout that splat viewers read, and as tensors that can be drawn and trained."""
+"""Gaussian splats: as a PLY file that splat viewers read, and as tensors that can be rendered and trained."""
 
 from __future__ import annotations
 
@@ -24,25 +24,28 @@ NORMALS = ("nx", "ny", "nz")
 
 @dataclass(frozen=True, kw_only=True)
 class Splats(Artifact):
-    """Gaussians in the shape of frame 0. Unlike other artifacts they are stored as PLY (binary, little endian)."""
+    """Gaussians in frame 0, stored as PLY (binary, little endian)."""
 
     kind: ClassVar[str] = "splats"
     means: np.ndarray = array("N,3", np.float32, "m", "centers in the world")
-    quaternions: np.ndarray = array("N,4", np.float32, "1", "orientations, w first, of any length but zero")
+    quaternions: np.ndarray = array("N,4", np.float32, "1", "orientations, w first, any length except zero")
     log_scales: np.ndarray = array("N,A", np.float32, "log m", "standard deviations: A = 1 isotropic, 3 one per axis")
     opacity_logits: np.ndarray = array("N", np.float32, "1", "opacity = 1 / (1 + exp(-.))")
     harmonics: np.ndarray = array("N,K,3", np.float32, "1", "color, see `neuspring.splats.view`; K = 1, 4, 9 or 16")
 
     def check(self) -> None:
         if self.log_scales.shape[1] not in (1, 3):
-            raise InputError("splats.log_scales", "one scale or three are required", self.log_scales.shape[1])
+            raise InputError("splats.log_scales", "one or three scales are required", self.log_scales.shape[1])
         if self.harmonics.shape[1] not in (1, 4, 9, 16):
             raise InputError("splats.harmonics", "1, 4, 9 or 16 coefficients are required", self.harmonics.shape[1])
         if len(self.means) == 0:
             raise InputError("splats", "at least one splat is required", "none")
 
     def save(self, path: Path) -> None:
-        """Write `path` (.ply) atomically, with the properties and order of splat files: three scales, also where one is for all."""
+        """Write `path` (.ply) atomically, with the usual properties of splat files in their order.
+
+        The file always has three scales per splat; isotropic splats repeat their scale.
+        """
         columns = _columns(3, self.harmonics.shape[1])
         bands = self.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(self.means), -1)
         parts = (self.means, np.zeros_like(self.means), self.harmonics[:, 0], bands, self.opacity_logits[:, None])
@@ -54,19 +57,19 @@ class Splats(Artifact):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a splat file, ours or another trainer's; three scales that are equal in every splat are one.
+        """Read a splat file of this or another trainer. Three scales become one if they are equal in every splat.
 
-        Raises InputError if it is missing, truncated or holds something else.
+        Raises InputError if the file is missing, is truncated or contains no splats.
         """
         table = _read_ply(Path(path))
         names = table.dtype.names or ()
         bands, scales = (sum(name.startswith(prefix) for name in names) for prefix in ("f_rest_", "scale_"))
         if bands % 3:
-            raise InputError(path, "f_rest_...: as many coefficients are required for each of three channels", bands)
+            raise InputError(path, "f_rest_...: three channels with equally many coefficients are required", bands)
         columns = _columns(scales, 1 + bands // 3)
         missing = [name for name in columns if name not in names and name not in NORMALS]
         if missing:
-            raise InputError(path, "must hold the properties of Gaussian splats", f"no {', '.join(missing)}")
+            raise InputError(path, "must have the properties of Gaussian splats", f"no {', '.join(missing)}")
         values = {name: table[name].astype(np.float32) for name in columns if name not in NORMALS}
 
         def stacked(prefix: str) -> np.ndarray:
@@ -85,11 +88,11 @@ class Splats(Artifact):
                 ),
             )
         except InputError as error:
-            raise InputError(path, "must hold usable splats", error) from error
+            raise InputError(path, "must contain usable splats", error) from error
 
 
 def _columns(scales: int, coefficients: int) -> list[str]:
-    """The properties of a splat file in their order; harmonics above the first are stored channel by channel."""
+    """Property names of a splat file in their order; harmonics above the first are stored channel by channel."""
     return [
         *("x", "y", "z", *NORMALS),
         *(f"f_dc_{k}" for k in range(3)),
@@ -102,11 +105,11 @@ def _columns(scales: int, coefficients: int) -> list[str]:
 
 def _read_ply(path: Path) -> np.ndarray:
     """The vertices of a binary PLY as a structured array."""
-    rule = "must be a binary little-endian PLY of vertices alone, with float properties of different names"
+    rule = "must be a binary little-endian PLY that has only vertices, with float properties of different names"
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(path, rule, error.strerror, "Run the step that makes it first.") from error
+        raise InputError(path, rule, error.strerror, "First run the stage that writes it.") from error
     head, end, _ = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = [line for line in head.decode("ascii", errors="replace").splitlines() if not line.startswith("comment ")]
     count = lines[2].removeprefix("element vertex ") if end and lines[:2] == ["ply", PLY_FORMAT] and len(lines) > 3 else ""
@@ -115,14 +118,14 @@ def _read_ply(path: Path) -> np.ndarray:
         raise InputError(path, rule, lines[:4] or repr(content[:40]))
     layout = np.dtype([(name, "<f4") for name in names])
     if (available := (len(content) - len(head) - len(end)) // layout.itemsize) < int(count):
-        received = f"{available} whole ones: the file is truncated"
-        raise InputError(path, f"the header promises {count} splats", received, "Delete it and re-run its step.")
+        received = f"{available}: the file is truncated"
+        raise InputError(path, f"the header promises {count} splats", received, "Delete the file, then rerun the same command.")
     return np.frombuffer(content, layout, int(count), offset=len(head) + len(end))
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """Splats as tensors on a device, in the form that is trained. Shapes as in `Splats`."""
+    """Splats as tensors on a device, for rendering and training. Shapes as in `Splats`."""
 
     means: torch.Tensor
     quaternions: torch.Tensor
@@ -132,16 +135,16 @@ class Gaussians:
 
     @classmethod
     def of(cls, splats: Splats, device: str = "cpu") -> Gaussians:
-        """Gaussians from stored splats."""
+        """Tensors of stored splats."""
         return cls(**{field.name: torch.tensor(getattr(splats, field.name), device=device) for field in dataclasses.fields(cls)})
 
     def stored(self) -> Splats:
-        """The same as an artifact."""
+        """These splats as an artifact."""
         return Splats(**{name: tensor.detach().cpu().numpy() for name, tensor in vars(self).items()})
 
     @property
     def opacities(self) -> torch.Tensor:
-        """[N]."""
+        """Opacities [N] in 0..1."""
         return torch.sigmoid(self.opacity_logits)
 
     @property
@@ -150,7 +153,7 @@ class Gaussians:
         return torch.exp(self.log_scales).expand(-1, 3)
 
     def draw(self, view: View, *, degree: int = 3, **options: Any) -> Rendered:
-        """A picture; harmonics above `degree` are not used. Options as in `rasterize`: background, limits, backend."""
+        """Render an image with harmonics up to `degree`. Options are those of `rasterize`: background, limits, backend."""
         degree = min(degree, math.isqrt(self.harmonics.shape[1]) - 1)
         tensors = (self.means, self.quaternions, self.scales, self.opacities, self.harmonics)
         return rasterize(*tensors, view, degree=degree, **options)

@@ -1,7 +1,7 @@
-"""One function that draws Gaussian splats, differentiably: color, coverage and expected depth.
+"""Differentiable rendering of Gaussian splats: color, coverage and expected depth.
 
-Backends: `warp`, ours, on CPU and CUDA from the same kernels (`blend`), and `gsplat` (Apache-2.0, extra `gpu`) on CUDA. `auto`
-takes gsplat where it works. Results name the backend.
+The backend `warp` runs the kernels of `blend` on CPU and CUDA. The backend `gsplat` (Apache-2.0, extra `gpu`) runs on CUDA.
+`auto` selects gsplat where it works. Results name the backend.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ LEAST_ALPHA = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A picture of splats."""
+    """A rendered image of splats."""
 
     rgb: torch.Tensor
-    """[H, W, 3], over the background; not clamped."""
+    """Color over the background [H, W, 3], not clamped."""
     alpha: torch.Tensor
-    """[H, W], coverage: 1 - transmittance."""
+    """Coverage [H, W]: 1 - transmittance."""
     depth: torch.Tensor
-    """[H, W] m along the optical axis, the mean over what covers the pixel; 0 where nothing does."""
+    """Mean depth along the optical axis of the splats that cover a pixel [H, W], m; 0 where no splat does."""
     index: torch.Tensor
-    """[M] int64: the splats that touch the picture."""
+    """Indices of the splats that touch the image [M], int64."""
     means: torch.Tensor
-    """[M, 2] px, their centers (with gsplat [1, N, 2], of all splats); keeps its gradient after a backward pass, which is large
-    where splats are too coarse."""
+    """Centers of these splats [M, 2], px; with gsplat those of all splats [1, N, 2].
+
+    The tensor keeps its gradient after a backward pass; the gradient is large for splats that are too coarse."""
     radii: torch.Tensor
-    """[M] px, three standard deviations."""
+    """Three standard deviations of these splats [M], px."""
     backend: Backend
 
 
@@ -55,10 +56,12 @@ def rasterize(
     limits: Limits = DEFAULT_LIMITS,
     backend: Backend = "warp",
 ) -> Rendered:
-    """Draw splats with means [N, 3] m, quaternions [N, 4] (w first, any length), standard deviations [N, 3] m, opacities [N].
+    """Render splats; differentiable in the first five arguments.
 
-    colors: RGB [N, 3], or with a `degree` harmonics [N, K, 3], used up to that degree. Differentiable in all five. Raises
-    InputError for wrong shapes and for entries that are not finite.
+    - `means` [N, 3], m; `quaternions` [N, 4], w first, any length; `scales`: standard deviations [N, 3], m; `opacities` [N].
+    - `colors`: RGB [N, 3], or, with `degree`, harmonics [N, K, 3], which are used up to that degree.
+
+    Raises InputError for wrong shapes and for entries that are not finite.
     """
     view.require_valid()
     splats = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
@@ -87,12 +90,12 @@ def rasterize(
 def _by_gsplat(
     splats: dict[str, torch.Tensor], view: View, degree: int | None, background: tuple[float, float, float], limits: Limits
 ) -> Rendered:
-    """As `rasterize`. Thresholds of coverage cannot be set: since gsplat 1.5 no splat covers more than 0.99, ours 0.999."""
+    """`rasterize` with gsplat, whose thresholds are fixed: a splat covers at most 0.99 from gsplat 1.5 on, here 0.999."""
     from gsplat import rasterization
 
-    own = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
-    if own != (DEFAULT_LIMITS.alpha_min, DEFAULT_LIMITS.alpha_max, DEFAULT_LIMITS.transmittance_min):
-        raise InputError("splats, limits", "gsplat keeps its own thresholds of coverage", own, "Take backend: warp.")
+    thresholds = (limits.alpha_min, limits.alpha_max, limits.transmittance_min)
+    if thresholds != (DEFAULT_LIMITS.alpha_min, DEFAULT_LIMITS.alpha_max, DEFAULT_LIMITS.transmittance_min):
+        raise InputError("splats, limits", "gsplat has fixed thresholds of coverage", thresholds, "Set backend: warp.")
     picture, alpha, facts = rasterization(
         splats["means"],
         torch.nn.functional.normalize(splats["quaternions"], dim=-1),
@@ -110,7 +113,7 @@ def _by_gsplat(
     flat = facts["means2d"]
     if flat.requires_grad:
         flat.retain_grad()
-    # Radii are one per axis since gsplat 1.5, one before.
+    # gsplat 1.5 and later return one radius per axis, earlier versions one in total.
     radii = facts["radii"][0].float()
     radii = radii.amax(-1) if radii.ndim == 2 else radii
     index = torch.nonzero(radii > 0).squeeze(1)
@@ -120,23 +123,23 @@ def _by_gsplat(
 
 
 def choose_backend(wanted: Literal["auto", "warp", "gsplat"], device: str) -> Backend:
-    """`auto` -> gsplat on CUDA where it works, else ours. Raises InputError for gsplat where it cannot work."""
+    """Select the backend: `auto` is gsplat on CUDA if it works, else warp. Raises InputError for a gsplat that does not work."""
     if wanted == "warp" or (wanted == "auto" and not device.startswith("cuda")):
         return "warp"
     if not (fault := _gsplat_fault(device)):
         return "gsplat"
     if wanted == "auto":
         return "warp"
-    raise InputError("images.backend", "gsplat must work on this machine", fault, "Take images.backend: auto or warp.")
+    raise InputError("images.backend", "gsplat must work on this machine", fault, "Set images.backend: auto or warp.")
 
 
 @functools.cache
 def _gsplat_fault(device: str) -> str:
-    """Reason why gsplat cannot draw on `device`; empty if it can. One splat is drawn to find out: gsplat compiles at first use."""
+    """Reason why gsplat cannot render on `device`; empty if it can. Renders one splat, because gsplat compiles at first use."""
     if not device.startswith("cuda"):
-        return f"it needs CUDA, the device is {device}"
+        return f"device {device}; gsplat needs CUDA"
     if importlib.util.find_spec("gsplat") is None:
-        return 'not installed (pip install -c workflow/envs/constraints.txt -e ".[gpu]")'
+        return 'no gsplat (pip install -c workflow/envs/constraints.txt -e ".[gpu]")'
     try:
         size = 16
         intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], device=device)
@@ -146,7 +149,7 @@ def _gsplat_fault(device: str) -> str:
         picture = rasterize(mean, turn, scale, opacity, torch.ones_like(mean), view, backend="gsplat")
     except Exception as error:
         return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return "" if float(picture.alpha.max()) > 0.4 else "it drew nothing"
+    return "" if float(picture.alpha.max()) > 0.4 else "an empty image"
 
 
 def _require_splats(splats: dict[str, torch.Tensor], degree: int | None) -> None:
@@ -159,8 +162,8 @@ def _require_splats(splats: dict[str, torch.Tensor], degree: int | None) -> None
         finite = torch.isfinite(tensor.detach())
         if not finite.all():
             bad = int((~finite).reshape(count, -1).any(1).sum())
-            raise InputError(f"splats, {name}", "every entry must be finite", f"{bad} of {count} splats are not")
+            raise InputError(f"splats, {name}", "every entry must be finite", f"{bad} of {count} splats that are not")
     if degree is not None and not 0 <= degree <= 3:
-        raise InputError("splats, degree", "harmonics of degree 0 to 3 can be drawn", degree)
+        raise InputError("splats, degree", "harmonics of degree 0 to 3 can be rendered", degree)
     if degree is not None and colors.shape[1] < (degree + 1) ** 2:
         raise InputError("splats, colors", f"degree {degree} needs {(degree + 1) ** 2} coefficients", colors.shape[1])

@@ -1,12 +1,12 @@
 """Linear blend skinning: the nodes of a twin carry the splats from frame to frame.
 
-Every node b has a rotation R_b between two frames, the one that best maps the offsets to its 16 nearest nodes of frame 0 (Kabsch).
-A splat at x follows its 16 nearest nodes (at their places before) with weights w_b ~ 1 / (|x - p_b| + 1e-6 m):
+Every node b has a rotation R_b between two frames. It best maps the offsets to the 16 nodes that are nearest in frame 0 (Kabsch).
+A splat at x follows its 16 nearest nodes, by positions p_b before the step, with weights w_b ~ 1 / (|x - p_b| + 1e-6 m):
 
     x' = sum_b w_b [R_b (x - p_b) + p'_b],    q' = normalize(sum_b w_b q(R_b)) q.
 
-Motion accumulates from frame to frame, as in the released evaluation. Nearest nodes come from a hash grid, so time and memory do
-not grow with nodes times splats.
+Motion accumulates from frame to frame, as in PhysTwin's released evaluation. A hash grid finds the nearest nodes, so time and
+memory do not grow with the product of nodes and splats.
 """
 
 import itertools
@@ -24,35 +24,35 @@ from neuspring.core.errors import InputError
 
 SKIN_NEIGHBORS = 16
 MOST_CELLS = 64
-"""Most cells of the hash grid along one axis."""
+"""Maximum number of cells of the hash grid along one axis."""
 SMALLEST_RADIUS = 1e-4
-"""m: least radius of a search for nodes."""
+"""Minimum radius of a search for nodes, m."""
 DEGENERATE = 1e-5
-"""A neighborhood whose second singular value is below this part of the first is a line: thinner than 0.3 % of its length."""
+"""A neighborhood is a line if its second singular value is below this fraction of the first: thinner than 0.3 % of its length."""
 POINT_SPREAD = 1e-30
-"""m^2: a neighborhood smaller than this is a point."""
+"""A neighborhood below this value is a point, m^2."""
 DISTANCE_OFFSET = 1e-6
-"""m, added to distances in weights."""
+"""Offset that weights add to distances, m."""
 DOUBLINGS = 60
 
 
 class Skin:
-    """Carries splats by nodes whose frame 0 is `nodes` [N, 3], m.
+    """Move splats with nodes whose positions in frame 0 are `nodes` [N, 3], m.
 
-    frozen: keep the nodes that each splat is bound to in its first step (weights follow), for real time.
+    frozen: each splat keeps the nodes of its first step, and only the weights change; fast enough for real time.
     """
 
     def __init__(self, nodes: np.ndarray, *, device: str = "cpu", frozen: bool = False) -> None:
         start_warp()
         if len(nodes) == 0 or not np.isfinite(nodes).all():
-            raise InputError("skinning, nodes", "at least one node, all finite, is required", np.shape(nodes))
+            raise InputError("skinning, nodes", "one or more nodes are required, all finite", np.shape(nodes))
         self._device, self._frozen = device, frozen
         self._bound: Any = None
         self._count = min(SKIN_NEIGHBORS, len(nodes))
-        # Where this radius holds too few nodes, the search doubles it. A larger start would make every search slower.
+        # The search doubles this radius where it contains too few nodes. A larger start would make every search slower.
         usual = np.median(cKDTree(nodes).query(nodes, k=[self._count])[0])
         self._radius = float(max(1.2 * usual, SMALLEST_RADIUS))
-        # Searches far from all nodes visit every cell, so cells should not be many more than nodes.
+        # Searches far from all nodes visit every cell, so the grid should not have many more cells than nodes.
         cells = np.clip(np.ceil(np.ptp(nodes, axis=0) / self._radius).astype(int) + 1, 1, MOST_CELLS)
         wide, deep, high = cells.tolist()
         self._grid = wp.HashGrid(wide, deep, high, device=device)
@@ -79,7 +79,7 @@ class Skin:
     def carry(
         self, positions: np.ndarray, means: torch.Tensor, quaternions: torch.Tensor
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """(means, quaternions) in every frame of a trajectory [F, N, 3], m, whose frame 0 they were made in."""
+        """Yield (means, quaternions) in every frame of a trajectory [F, N, 3], m; the given ones are those of frame 0."""
         yield means, quaternions
         for before, after in itertools.pairwise(positions):
             means, quaternions = self.step(before, after, means, quaternions)
@@ -108,7 +108,7 @@ class Skin:
 
 
 def _on_torch_stream(device: str) -> AbstractContextManager[Any]:
-    """Torch orders its own work on its current stream, so copies, grid and kernels must run there too."""
+    """Run Warp on Torch's current stream, on which Torch orders its own work."""
     if device == "cpu":
         return nullcontext()
     stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
@@ -126,9 +126,9 @@ def nearest(
     neighbors: wp.array2d[int],
     distances: wp.array2d[float],
 ):
-    """The `wanted` nearest points of each query, nearest first; with `own`, query i is point i and does not count itself.
+    """The `wanted` nearest points of each query, nearest first. With `own`, query i is point i and excludes itself.
 
-    The search radius doubles until it holds enough points.
+    The search radius doubles until it contains enough points.
     """
     t = wp.tid()
     place = queries[t]
@@ -155,7 +155,7 @@ def nearest(
 
 @wp.func
 def shortest_turn(start: wp.vec3d, end: wp.vec3d):
-    """The rotation by the least angle that takes unit vector `start` to `end`."""
+    """The rotation with the smallest angle that maps the unit vector `start` to `end`."""
     axis = wp.cross(start, end)
     cosine = wp.dot(start, end)
     identity = wp.identity(n=3, dtype=wp.float64)
@@ -164,7 +164,7 @@ def shortest_turn(start: wp.vec3d, end: wp.vec3d):
         cross = wp.skew(axis)
         turn = identity + cross + cross * cross * (wp.float64(1.0) / (wp.float64(1.0) + cosine))
     else:
-        # Half a turn: about any axis that is perpendicular.
+        # A half turn about any perpendicular axis.
         other = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
         if wp.abs(start[0]) > wp.float64(0.9):
             other = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
@@ -180,7 +180,7 @@ def turn_nodes(
     neighbors: wp.array2d[int],
     rotations: wp.array[wp.mat33],
 ):
-    """The rotation that best takes each node's offsets to its neighbors from `before` to `after`."""
+    """The rotation that best maps each node's offsets to its neighbors from `before` to `after`."""
     i = wp.tid()
     moment = wp.mat33d()
     for k in range(neighbors.shape[1]):
@@ -211,7 +211,7 @@ def move_splats(
     t = wp.tid()
     place = means[t]
     total = wp.float32(0.0)
-    # Displacements, not places, are averaged: they keep their digits far from the origin.
+    # Averages displacements, not positions: far from the origin they keep their precision.
     shift = wp.vec3(0.0)
     blend = wp.quat(0.0, 0.0, 0.0, 0.0)
     for k in range(bound.shape[1]):

@@ -1,7 +1,8 @@
-"""Training of splats on the views of frame 0: Adam, one view per step, more harmonics in stages, adaptive density.
+"""Training of splats on the views of frame 0: Adam, one view per step, increasing degree of harmonics, adaptive density.
 
-Density adapts after Kerbl et al. 2023, section 5.2: a splat whose place in the picture has a mean gradient above a threshold is too
-coarse. Small ones are cloned, large ones split; faint and huge ones go. The other steps are those of the released appearance.
+Density follows Kerbl et al. 2023, section 5.2. A splat is too coarse if the mean gradient of its image position is above a
+threshold: small splats are cloned, large splats are split. Faint and huge splats are removed. All else follows PhysTwin's
+released training.
 """
 
 from __future__ import annotations
@@ -23,40 +24,40 @@ from neuspring.splats.rasterize import Backend, Rendered
 from neuspring.splats.view import C0, rotations
 
 SCALE_NEIGHBORS = 3
-"""The first scale of a splat is its mean distance to this many neighbors."""
+"""The initial scale of a splat is its mean distance to this many neighbors."""
 FIRST_OPACITY = 0.1
 RESET_OPACITY, RESET_EVERY = 0.01, 3000
-"""Steps between two resets of all opacities to at most this."""
+"""Maximum opacity after a reset, and steps between two resets."""
 DEGREE_EVERY = 1000
-"""Steps after which the degree of the harmonics in use rises by one; it starts from 0."""
+"""Steps between increments of the degree of the harmonics, which starts at 0."""
 POSITION_RATE_END, POSITION_STEPS = 1.6e-6, 30_000
-"""Learning rate of means after so many steps, per extent; log-linear before."""
+"""Final learning rate of means per extent, and the steps of its log-linear decay."""
 ROTATION_RATE = 1e-3
 DENSIFY_FROM, DENSIFY_UNTIL, DENSIFY_EVERY = 500, 15_000, 100
-"""Steps between which splats are cloned, split and pruned, and steps between two rounds of it, as released."""
+"""First and last step, and interval, of cloning, splitting and pruning, as in PhysTwin's release."""
 DENSIFY_GRADIENT = 2e-4
-"""Least mean gradient of a splat's place in the picture, per half picture, for which it is cloned or split."""
+"""Minimum mean gradient of a splat's image position, in half images, for cloning or splitting it."""
 SPLIT_SIZE = 0.01
-"""Size, as part of the extent, above which a splat is split; smaller ones are cloned."""
+"""Splats above this size, as a fraction of the extent, are split; smaller splats are cloned."""
 MOST_SPLATS = 300_000
 PRUNE_OPACITY = 0.005
-"""Splats below it are removed."""
+"""Splats with a lower opacity are removed."""
 PRUNE_RADIUS, PRUNE_SIZE = 20.0, 0.1
-"""After the first reset of opacities, splats are removed whose radius ever exceeded so many pixels, or this part of the extent."""
+"""Maximum radius of a splat, px, and maximum size as a fraction of the extent, both from the first reset of opacities on."""
 RECORD_EVERY = 10
-"""Steps between entries of the history."""
+"""Steps between two entries of the history."""
 LEAST_FIRST_SCALE = 1e-6
-"""m: least first scale."""
+"""Minimum initial scale, m."""
 ADAM_EPSILON = 1e-15
 MOMENTS = ("exp_avg", "exp_avg_sq")
 CHILDREN = 2
 SHRINK = 1.6
-"""A child of a split is smaller than its parent by this factor."""
+"""Ratio of the sizes of a parent and of its children after a split."""
 
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats and the history of their training."""
+    """Trained splats and the history of their training."""
 
     splats: Splats
     history: dict[str, list[float]]
@@ -66,7 +67,10 @@ class TrainedSplats:
 
 
 def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, width: float) -> Splats:
-    """Splats at points [P, 3], m, with RGB [P, 3]; a pixel is `width` wide at the object, m. Raises InputError for less than 4."""
+    """Initial splats at points [P, 3], m, with RGB [P, 3]; `width` is that of a pixel at the object, m.
+
+    Raises InputError for fewer than four splats.
+    """
     if settings.spacing and len(points):
         cells = np.floor((points - points.min(axis=0)) / (settings.spacing * width)).astype(np.int64)
         _, owner, members = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
@@ -74,7 +78,7 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
         sums = [np.bincount(owner, weights=values) / members for values in (*points.T, *colors.T)]
         points, colors = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
     if len(points) <= SCALE_NEIGHBORS:
-        rule = f"more than {SCALE_NEIGHBORS} points are needed to begin with"
+        rule = f"more than {SCALE_NEIGHBORS} points are required"
         raise InputError("appearance, points of frame 0", rule, len(points))
     scale = np.maximum(cKDTree(points).query(points, k=SCALE_NEIGHBORS + 1)[0][:, 1:].mean(axis=1), LEAST_FIRST_SCALE)
     if settings.fixed_radius is not None:
@@ -92,7 +96,10 @@ def first_splats(points: np.ndarray, colors: np.ndarray, settings: Appearance, w
 
 
 def extent_of(shots: Sequence[Shot]) -> float:
-    """1.1 times the largest distance of a camera from their mean, m; for a single camera, its distance to the object."""
+    """Extent of the scene, m: 1.1 times the largest distance of a camera from the mean of all cameras.
+
+    For a single camera it is the median depth of the object, or 1 m without depth.
+    """
     if len(shots) == 1:
         measured = shots[0].depth[shots[0].depth > 0]
         return float(measured.median()) if len(measured) else 1.0
@@ -101,16 +108,16 @@ def extent_of(shots: Sequence[Shot]) -> float:
 
 
 def train(start: Splats, shots: Sequence[Shot], settings: Appearance, seed: int, backend: Backend) -> TrainedSplats:
-    """Fit splats to the shots. Deterministic on the CPU for a seed.
+    """Fit splats to the shots. For a given seed the result is deterministic on the CPU.
 
-    Raises NumericalFailure if splats become infinite or all of them are removed.
+    Raises NumericalFailure if splats become infinite or if all of them are removed.
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = _Optimizer(Gaussians.of(start, str(shots[0].view.intrinsics.device)), settings, extent_of(shots))
     statistics = Statistics.empty(optimizer.gaussians.means)
     history: dict[str, list[float]] = {"step": [], "loss": [], "splats": []}
     progress = Progress("appearance", settings.iterations)
-    # Splats that the last step adds would not be trained.
+    # Splats added in the last step would stay untrained.
     last_change = min(DENSIFY_UNTIL, settings.iterations)
     for step, shot in zip(range(1, settings.iterations + 1), _shuffled(shots, generator), strict=False):
         optimizer.schedule(step)
@@ -145,19 +152,18 @@ def _shuffled(shots: Sequence[Shot], generator: torch.Generator) -> Iterator[Sho
 
 @dataclass(frozen=True, kw_only=True)
 class SplatRates(Appearance):
-    """The settings with the learning rates of the released training."""
+    """The settings with the learning rates of PhysTwin's released training."""
 
     position_rate: float = 1.6e-4
-    """Learning rate of means at the start, per extent of the scene: 1.1 times the largest distance of a camera from the center of
-    all."""
+    """Initial learning rate of means, per extent of the scene (`extent_of`)."""
     color_rate: float = 2.5e-3
-    """Learning rate of the first harmonic; that of the others is a twentieth."""
+    """Learning rate of the first harmonic; the rate of the other harmonics is a twentieth of it."""
     scale_rate: float = 5e-3
     """Learning rate of log scales."""
 
 
 class _Optimizer:
-    """Adam over the tensors of `Gaussians`, whose number may change."""
+    """Adam over the tensors of `Gaussians`; the number of splats may change."""
 
     def __init__(self, gaussians: Gaussians, settings: Appearance, extent: float) -> None:
         settings = SplatRates(**vars(settings))
@@ -181,12 +187,12 @@ class _Optimizer:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The splats as they are now."""
+        """The current splats."""
         values = dict(self._values)
         return Gaussians(harmonics=torch.cat([values.pop("base"), values.pop("bands")], dim=1), **values)
 
     def schedule(self, step: int) -> None:
-        """Lower the learning rate of the means, log-linearly."""
+        """Lower the learning rate of the means log-linearly."""
         done = min(step / POSITION_STEPS, 1.0)
         rate = math.exp((1 - done) * math.log(self.settings.position_rate) + done * math.log(POSITION_RATE_END))
         self._adam.param_groups[0]["lr"] = rate * self.extent
@@ -197,7 +203,7 @@ class _Optimizer:
         self._adam.zero_grad(set_to_none=True)
 
     def require_usable(self, step: int) -> None:
-        """Raise NumericalFailure for splats that cannot be rendered."""
+        """Raise NumericalFailure if splats cannot be rendered."""
         if not len(self._values["means"]):
             raise NumericalFailure(f"appearance: step {step} removed the last splat")
         bad = [name for name, tensor in self._values.items() if not torch.isfinite(tensor.detach()).all()]
@@ -206,7 +212,7 @@ class _Optimizer:
             raise NumericalFailure(f"appearance: after step {step} splats are not finite ({', '.join(bad) or 'scales'})")
 
     def replace(self, stay: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
-        """Leave the splats `stay` [N] bool with their moments, append others without."""
+        """Keep the splats `stay` [N] bool with their moments; append `added` with zero moments."""
         new = _parameters(added)
         for group in self._adam.param_groups:
             name, old = group["name"], group["params"][0]
@@ -219,7 +225,7 @@ class _Optimizer:
 
     @torch.no_grad()
     def reset_opacities(self) -> None:
-        """Dim all splats, so that those that no picture needs stay dim and are removed."""
+        """Limit all opacities: splats that no image needs stay faint and are removed later."""
         tensor = self._values["opacity_logits"]
         tensor.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         for moment in MOMENTS:
@@ -227,7 +233,7 @@ class _Optimizer:
 
 
 def _parameters(splats: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors that Adam trains. The first harmonic learns faster than the others, so it is a parameter of its own."""
+    """The tensors that Adam trains. The first harmonic learns faster than the others, so it is a separate parameter."""
     shades = splats["harmonics"]
     others = {name: tensor for name, tensor in splats.items() if name != "harmonics"}
     return others | {"base": shades[:, :1], "bands": shades[:, 1:]}
@@ -235,23 +241,23 @@ def _parameters(splats: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 @dataclass
 class Statistics:
-    """Statistics of each splat in the pictures since their number last changed."""
+    """Statistics of each splat over the rendered images since the number of splats last changed."""
 
     pull: torch.Tensor
-    """[N] sum of gradients of the place in the picture, per half picture."""
+    """Sum of the norms of the gradient of the image position, in half images [N]."""
     seen: torch.Tensor
-    """[N] number of pictures that show it."""
+    """Number of images that show the splat [N]."""
     radius: torch.Tensor
-    """[N] largest, as a part of the picture's width."""
+    """Largest radius, as a fraction of the image width [N]."""
 
     @classmethod
     def empty(cls, like: torch.Tensor) -> Statistics:
-        """Statistics of no pictures, for splats with means `like` [N, 3]."""
+        """Statistics over no images, for splats with means `like` [N, 3]."""
         return cls(like.new_zeros(len(like)), like.new_zeros(len(like)), like.new_zeros(len(like)))
 
     @torch.no_grad()
     def add(self, rendered: Rendered, width: int, height: int) -> None:
-        """Account for a picture after its backward pass."""
+        """Add an image after its backward pass."""
         if (gradient := rendered.means.grad) is None:
             return
         if rendered.backend == "gsplat":
@@ -271,18 +277,18 @@ def densify(
     after_reset: bool,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The splats that stay [N] bool, and the new ones, with the keys of `splats` (those of `Gaussians`).
+    """Clone, split and prune splats: returns which splats stay [N] bool, and the new splats with the keys of `splats`.
 
-    `extent`, m, is the size of the scene; `after_reset` also removes splats that are huge.
+    The keys are those of `Gaussians`. `extent` is the size of the scene, m; with `after_reset` huge splats are removed too.
     """
     size = torch.exp(splats["log_scales"]).amax(1)
     mean_pull = statistics.pull / statistics.seen.clamp_min(1)
     coarse = mean_pull > DENSIFY_GRADIENT
     room = max(MOST_SPLATS - len(size), 0)
-    # The coarsest ones first where there is no room for all.
+    # If the limit does not allow all, the splats with the largest gradients come first.
     if int(coarse.sum()) > room:
         coarse = torch.zeros_like(coarse).index_fill_(0, torch.topk(mean_pull, room).indices, True) & coarse
-    # A split makes smaller splats, so splats of a fixed radius are cloned.
+    # A split makes splats smaller, so splats with a fixed radius are cloned instead.
     split = coarse & (size > SPLIT_SIZE * extent) & (settings.fixed_radius is None)
     added = {name: tensor[coarse & ~split] for name, tensor in splats.items()}
     if split.any():
@@ -300,7 +306,7 @@ def densify(
 
 
 def _superfluous(splats: Mapping[str, torch.Tensor], settings: Appearance, extent: float, after_reset: bool) -> torch.Tensor:
-    """Faint splats [N], after a reset also huge ones."""
+    """Which splats are faint or, after a reset, huge [N] bool."""
     faint = torch.sigmoid(splats["opacity_logits"]) < PRUNE_OPACITY
     if not after_reset or settings.fixed_radius:
         return faint

@@ -1,13 +1,13 @@
-"""Projection of splats in the world to ellipses in the picture: pinhole views, the rasterizer's thresholds, and colors.
+"""Projection of splats from the world to ellipses in the image: pinhole views, thresholds of the rasterizer, and colors.
 
-With p = R x + t the camera point and Sigma = Rq diag(s^2) Rq^T the covariance of a splat, its mean in the picture is
-(fx px/pz + cx, fy py/pz + cy) and its covariance there J R Sigma R^T J^T + blur 1, J the Jacobian of the projection, taken at
-slopes px/pz, py/pz clamped to a margin around the picture (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
-Plain torch on any device and precision: gradients come by differentiation, through those limits too.
+Let p = R x + t be the center of a splat in camera coordinates and Sigma = Rq diag(s^2) Rq^T its covariance. In the image its mean
+is (fx px/pz + cx, fy py/pz + cy) and its covariance is J R Sigma R^T J^T + blur 1. J is the Jacobian of the projection at the
+slopes px/pz and py/pz, clamped to a margin around the image (Zwicker et al., EWA splatting, 2001; Kerbl et al. 2023).
+The code is plain Torch, for any device and precision. Torch differentiates it, including the clamps.
 
-Colors depend on direction by real spherical harmonics up to degree 3, in the order of Gaussian splats (l = 0.., m = -l..l):
+Colors depend on direction by real spherical harmonics up to degree 3, in the order of splat files (l = 0.., m = -l..l):
 color(d) = max(0, 1/2 + sum_k Y_k(d) c_k), d the unit direction from the camera to the splat in the world, c_k [3] RGB.
-The signs are those of the Condon-Shortley phase (Y_1 = -y, z, -x), as splat files have them.
+Signs follow the Condon-Shortley phase (Y_1 = -y, z, -x), as in splat files.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import torch
 from neuspring.core.errors import InputError
 
 PICTURE_MARGIN = 0.3
-"""Slopes in the Jacobian may leave the picture by this part of its half width or height."""
+"""Slopes in the Jacobian may leave the image by this fraction of its half width or height."""
 BOX_MARGIN = 1e-3
-"""Bounding boxes are wider by this part, so that rounding cuts off no pixel."""
+"""Bounding boxes are wider by this fraction, so that rounding cuts off no pixel."""
 C0 = 0.5 / math.sqrt(math.pi)
 """Y_0."""
 _C1 = math.sqrt(3 / (4 * math.pi))
@@ -39,19 +39,19 @@ _C3 = (
 
 @dataclass(frozen=True)
 class Limits:
-    """Thresholds of splatting; the defaults are those that the released evaluation was rendered with."""
+    """Thresholds of splatting; the defaults are those of PhysTwin's released evaluation."""
 
     near: float = 0.01
-    """m along the optical axis; nearer splats are not drawn."""
+    """Splats nearer than this are not rendered, m along the optical axis."""
     far: float = 1e10
     blur: float = 0.3
-    """Added to the variance of every splat in the image, px^2."""
+    """Variance that is added to every splat in the image, px^2."""
     alpha_min: float = 1 / 255
-    """Coverage below this is skipped."""
+    """Contributions with less coverage are skipped."""
     alpha_max: float = 0.999
-    """No splat covers more than this."""
+    """Maximum coverage of one splat."""
     transmittance_min: float = 1e-4
-    """A pixel is done before the splat that would leave no more than this transmittance."""
+    """Blending of a pixel stops before the splat that would reduce transmittance to this or less."""
 
 
 DEFAULT_LIMITS = Limits()
@@ -59,12 +59,15 @@ DEFAULT_LIMITS = Limits()
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A pinhole camera: OpenCV axes (x right, y down, z forward), the center of pixel (column j, row i) at (j + 0.5, i + 0.5)."""
+    """A pinhole camera with OpenCV axes (x right, y down, z forward).
+
+    The center of the pixel in column j and row i is at (j + 0.5, i + 0.5).
+    """
 
     world_to_camera: torch.Tensor
-    """[4, 4], m."""
+    """Pose [4, 4], m."""
     intrinsics: torch.Tensor
-    """K [3, 3], pixels."""
+    """K [3, 3], px."""
     width: int
     height: int
 
@@ -72,9 +75,9 @@ class View:
     def of(
         cls, camera_to_world: np.ndarray, intrinsics: np.ndarray, width: int, height: int, device: str = "cpu", shift: float = 0.5
     ) -> View:
-        """View of a calibrated camera whose pixel centers lie at whole coordinates, `shift` pixels away from those here.
+        """View of a calibrated camera whose pixel centers are at integer coordinates: `shift` is added to its principal point.
 
-        shift = 0 takes the intrinsics as they are, as the released rendering does: a picture half a pixel off.
+        shift = 0 keeps the intrinsics, as the released rendering does; its images are half a pixel off.
         """
         k = np.array(intrinsics, dtype=np.float64)
         k[:2, 2] += shift
@@ -88,7 +91,7 @@ class View:
         return pose[:3, 3]
 
     def require_valid(self) -> None:
-        """Raise InputError for a view that cannot be drawn."""
+        """Raise InputError for a view that cannot be rendered."""
         if self.width < 1 or self.height < 1:
             raise InputError("view", "width and height must be at least one pixel", (self.width, self.height))
         if not (torch.isfinite(self.world_to_camera).all() and torch.isfinite(self.intrinsics).all()):
@@ -97,22 +100,22 @@ class View:
 
 @dataclass(frozen=True)
 class Projected:
-    """The splats between near and far plane, as ellipses."""
+    """The splats between the near and the far plane, as ellipses."""
 
     index: torch.Tensor
-    """[M] int64: which splats."""
+    """Indices of the splats [M], int64."""
     means: torch.Tensor
-    """[M, 2] px."""
+    """Centers [M, 2], px."""
     covariances: torch.Tensor
-    """[M, 3] xx, xy, yy, px^2."""
+    """Covariances xx, xy, yy [M, 3], px^2."""
     conics: torch.Tensor
-    """[M, 3] their inverses."""
+    """Inverse covariances [M, 3], px^-2."""
     depths: torch.Tensor
-    """[M] m along the optical axis."""
+    """Depths along the optical axis [M], m."""
 
 
 def rotations(quaternions: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4], w first, of any length but zero."""
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], w first, any length except zero."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -134,13 +137,13 @@ def project(means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor
     a, b = _limited(x / z, fx, cx, view.width), _limited(y / z, fy, cy, view.height)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * a / z, zero, fy / z, -fy * b / z], dim=-1).reshape(-1, 2, 3)
-    # cov = (J R Rq S)(J R Rq S)^T: a product of one factor with itself stays positive in single precision.
+    # cov = (J R Rq S)(J R Rq S)^T: the product of a factor and its transpose stays positive in single precision.
     factor = jacobian @ turn @ rotations(quaternions[index]) * scales[index, None, :]
     u, v = factor.unbind(1)
     xx = (u * u).sum(-1) + limits.blur
     xy = (u * v).sum(-1)
     yy = (v * v).sum(-1) + limits.blur
-    # (u.u + blur)(v.v + blur) - (u.v)^2 = |u x v|^2 + blur (u.u + v.v) + blur^2 without the cancellation of long needles.
+    # (u.u + blur)(v.v + blur) - (u.v)^2 = |u x v|^2 + blur (u.u + v.v) + blur^2, without cancellation for long, thin splats.
     area = torch.linalg.cross(u, v)
     determinant = (area * area).sum(-1) + limits.blur * ((u * u).sum(-1) + (v * v).sum(-1)) + limits.blur * limits.blur
     conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
@@ -154,9 +157,9 @@ def _limited(slope: torch.Tensor, focal: torch.Tensor, center: torch.Tensor, siz
 
 @torch.no_grad()
 def boxes(projected: Projected, opacities: torch.Tensor, view: View, limits: Limits) -> tuple[torch.Tensor, torch.Tensor]:
-    """True for projected splats that touch the picture [M], and the pixels they touch [M, 4] int: x0, y0, x1, y1, ends excluded.
+    """Which projected splats touch the image [M] bool, and their pixels [M, 4] int: x0, y0, x1, y1, ends excluded.
 
-    alpha >= alpha_min needs a Mahalanobis square of at most 2 ln(opacity / alpha_min), an ellipse with these half widths.
+    A splat touches a pixel if alpha >= alpha_min: the squared Mahalanobis distance is at most 2 ln(opacity / alpha_min).
     """
     reach = 2 * torch.log(opacities / limits.alpha_min)
     half = torch.sqrt(reach.clamp_min(0.0)[:, None] * projected.covariances[:, [0, 2]]) * (1 + BOX_MARGIN)
@@ -175,7 +178,7 @@ def radii(projected: Projected) -> torch.Tensor:
 
 
 def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
-    """Y_k [..., (degree + 1)^2] in unit directions [..., 3]."""
+    """Spherical harmonics Y_k [..., (degree + 1)^2] in unit directions [..., 3]."""
     x, y, z = directions.unbind(-1)
     rows = [torch.full_like(x, C0)]
     if degree > 0:
@@ -198,18 +201,18 @@ def basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
 
 
 TURN_SAMPLES = 24
-"""Directions in which a color is compared before and after a turn; 15 coefficients above the first are fitted to them."""
+"""Number of directions in which rotated colors are sampled, to fit the 15 coefficients above the first."""
 
 
 def turned_harmonics(coefficients: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Coefficients [N, K, 3] of splats that are turned by `turns` [N, 3, 3] with their colors: color'(d) = color(R^T d).
+    """Coefficients [N, K, 3] after the rotations `turns` [N, 3, 3] of splats and their colors: color'(d) = color(R^T d).
 
-    A turned harmonic is a sum of harmonics of its band, so least squares over a few fixed directions are exact.
+    A rotated harmonic is a sum of harmonics of its band, so least squares over a few fixed directions is exact.
     """
     degree = math.isqrt(coefficients.shape[1]) - 1
     if not coefficients[:, 1:].any():
         return coefficients
-    # Spread evenly by the golden angle, at heights between which the sphere has equal areas.
+    # The directions are uniform: the golden angle, and heights that divide the sphere into equal areas.
     step = torch.arange(TURN_SAMPLES, dtype=torch.float64)
     height, angle = 1 - (2 * step + 1) / TURN_SAMPLES, step * math.pi * (3 - math.sqrt(5))
     level = torch.sqrt(1 - height**2)
@@ -220,7 +223,7 @@ def turned_harmonics(coefficients: torch.Tensor, turns: torch.Tensor) -> torch.T
 
 
 def harmonic_colors(coefficients: torch.Tensor, offsets: torch.Tensor, degree: int) -> torch.Tensor:
-    """RGB [N, 3] of coefficients [N, K, 3] seen along `offsets` [N, 3] (any length); bands above `degree` are not used."""
+    """RGB [N, 3] of coefficients [N, K, 3] up to `degree`, seen along `offsets` [N, 3] (any length)."""
     used = (degree + 1) ** 2
     values = basis(torch.nn.functional.normalize(offsets, dim=-1), degree)
     return torch.clamp_min(torch.einsum("nk,nkc->nc", values, coefficients[:, :used]) + 0.5, 0.0)

@@ -1,8 +1,8 @@
-"""The steps of the workflow: one file is one typed function, one rule, one command and one record.
+"""The stages of the workflow: each module is one typed function, one command and one record.
 
-Every module here has a function of its own name, decorated by `neuspring.stages.stage.stage`, whose docstring explains the
-signature and the declarations. To add a stage: its module and its name in `FLOW`, or in a package of your own an entry point of the
-group `neuspring.stages`; the workflow and the command line ask the declarations and know no stage by name.
+Every module contains a function of the same name with the decorator `neuspring.stages.stage.stage`; the docstring of that module
+explains the signature and the declarations. To add a stage, add its module and its name in `FLOW`, or, in another package, an
+entry point of the group `neuspring.stages`. The workflow and the command line read only declarations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from neuspring.stages.stage import Stage
 
 LEARNED = "learned"
-"""The input that is the record of whatever learned the run's model."""
+"""Name of the input that is the record of the last learning stage of a run."""
 FLOW = """
     capture segment track lift observe
     search fit appearance train
@@ -24,13 +24,13 @@ FLOW = """
 STAGES: Registry[Stage] = Registry(
     "stages", {name: f"{__name__}.{name}:{name}" for name in FLOW.split()}, "neuspring.stages.stage:Stage"
 )
-"""In the order in which they read from each other."""
+"""All stages; each comes after the stages whose products it reads."""
 
 
 def makers(name: str) -> list[Stage]:
-    """The stages whose product is an input of this name; those that learn a model, the last one first, for `learned`."""
+    """The stages that write the input of this name; for `learned`, the learning stages, last one first."""
     from neuspring.core.run_folder import LEARNING_STAGES
 
     if name == LEARNED:
         return [STAGES[learning] for learning in reversed(LEARNING_STAGES)]
-    return [one for one in STAGES.values() if one.product == name]
+    return [stage for stage in STAGES.values() if stage.product == name]

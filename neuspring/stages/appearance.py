@@ -1,4 +1,4 @@
-"""Frame 0 of a capture -> Gaussian splats."""
+"""Stage `appearance`: frame 0 of a capture -> Gaussian splats."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ if TYPE_CHECKING:
     from neuspring.splats.losses import Shot
 
 BESIDE_HANDS, SAME_SURFACE = 6, 0.02
-"""Pixels beside hands in an image of `losses.REFERENCE_WIDTH` whose points may have a hand's color, since the borders of masks are
-off by pixels; and m by which the depth of a pixel may differ from a point that it shows."""
+"""BESIDE_HANDS: margin around hands, pixels of an image of `losses.REFERENCE_WIDTH`, in which points may have a hand's color
+because mask borders are inexact. SAME_SURFACE: largest difference, m, between a pixel's depth and the point that it shows."""
 NEAR_SEEN = 1.5
-"""Widths of a pixel: points of the shape prior this near to a seen one add nothing."""
+"""Distance in pixel widths within which a point of the shape prior duplicates an observed point."""
 
 
 @stage(
     output="{scenario}/{looks}/{seed}/appearance.json",
     reads=lambda settings, given: (
         *("images.backend", "images.appearance"),
-        # Perception has not lifted the masks of processed data.
+        # Processed data have masks that perception has not lifted.
         *(() if given.get("lifted") else ("perception.lift",)),
     ),
     gpu=True,
     memory_mb=8000,
     minutes=240,
     when=lambda rows: rows.images,
-    # Perception's record says more than the observations where splats begin.
+    # For videos, the record of perception contains more initial points than the observations.
     without=lambda rows: ("observations",) if rows.source.films else (),
     shared=lambda config, row: None if row.appearance is None else config.images.appearance,
 )
@@ -55,7 +55,7 @@ def appearance(
 ) -> Written:
     """Frame 0 of a capture -> splats: splats.ply, history.parquet, appearance.png.
 
-    The first splats lie on the points that perception lifted and its shape prior (`lifted`), or, of processed data, on the lifted
+    The initial splats are at the points and the shape prior of perception (`lifted`). For processed data, they are at the lifted
     masks and the surface points of `observations`.
     """
     import pandas as pd
@@ -71,15 +71,15 @@ def appearance(
     images = settings.images
     masks_of = masks_of_cameras(capture, paths(masks))
     backend = choose_backend(images.backend, device)
-    supposed = read_npz(lifted.file("depth"))[0] if lifted is not None and lifted.has("depth") else {}
-    depths = {name: supposed.get(name, capture.depth(name, 0)) for name in capture.cameras}
+    estimated = read_npz(lifted.file("depth"))[0] if lifted is not None and lifted.has("depth") else {}
+    depths = {name: estimated.get(name, capture.depth(name, 0)) for name in capture.cameras}
     shots = _shots(capture, masks_of, images, device, depths)
     width = float(np.nanmedian([shot.pixel_width for shot in shots]))
     surface = _surface(capture, masks_of, settings, seed, width, lifted, observations)
     beside = beside_hands(capture, masks_of, depths, surface.cloud)
-    # Where all lies at hands there is nothing else to begin with.
+    # If all points are near hands, there are no others to start from.
     if 0 < beside.sum() < len(beside):
-        print(f"{beside.sum()} of {len(beside)} points beside hands become no splats", flush=True)
+        print(f"{beside.sum()} of {len(beside)} points are next to hands; no splats are initialized there", flush=True)
         surface = replace(surface, cloud=surface.cloud[~beside], colors=surface.colors[~beside])
     _require_outside(capture, np.concatenate([surface.cloud, surface.prior]))
     start = images.appearance.start
@@ -92,7 +92,7 @@ def appearance(
     views = {shot.name: picture(gaussians, shot.view, backend) for shot in shots}
     around = {angle: orbit_view(gaussians, shots[0].view, backend, angle) for angle in (90, 180, 270)}
     figures.appearance_figure(shots, views, around, files["picture"])
-    behind = {shot.name: _behind_hands(shot, views[shot.name]) for shot in shots}
+    hidden = {shot.name: _behind_hands(shot, views[shot.name]) for shot in shots}
     facts: dict[str, Any] = {
         "splats": len(trained.splats.means),
         "first_splats": trained.first,
@@ -104,38 +104,38 @@ def appearance(
         "cameras": [shot.name for shot in shots],
         "unseen_surface": surface.hidden,
         **{f"psnr_{shot.name}": _quality(shot, views[shot.name]) for shot in shots},
-        **{f"behind_hands_{name}": share for name, share in behind.items()},
+        **{f"behind_hands_{name}": share for name, share in hidden.items()},
     }
-    unseen = "a part that is unknown without a shape prior" if surface.hidden is None else f"{surface.hidden:.0%} of the surface"
-    hands = ", ".join(f"camera {name} {share:.0%}" for name, share in behind.items())
-    print(f"{facts['splats']} splats; frame 0 hides {unseen}; of the picture behind hands: {hands}", flush=True)
+    unseen = "an unknown fraction (no shape prior)" if surface.hidden is None else f"{surface.hidden:.0%}"
+    hands = ", ".join(f"camera {name} {share:.0%}" for name, share in hidden.items())
+    print(f"{facts['splats']} splats; {unseen} of the surface is not visible in frame 0; covered by hands: {hands}", flush=True)
     return Written(files=files, facts=facts)
 
 
 def beside_hands(capture: Capture, masks: Mapping[str, Masks], depths: Mapping[str, np.ndarray], points: np.ndarray) -> np.ndarray:
-    """True for points [P, 3], m, that some camera shows in frame 0 beside or beneath the mask of a hand or a person.
+    """True for points [P, 3], m, that any camera shows in frame 0 in or next to the mask of a hand or a person.
 
-    `depths` [H, W], m, of frame 0 by camera say which point a pixel shows.
+    `depths`: depth [H, W], m, of frame 0 by camera, which decides whether a pixel shows a point.
     """
     import cv2
 
     from neuspring.splats.losses import REFERENCE_WIDTH
 
-    found = np.zeros(len(points), bool)
+    beside = np.zeros(len(points), bool)
     for name, camera in capture.cameras.items():
         side = 2 * max(round(BESIDE_HANDS * camera.width / REFERENCE_WIDTH), 1) + 1
         near = cv2.dilate((masks[name].labels[0] >= HANDS).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         pixels, distance = camera.project(points.astype(float))
         shown = camera.sees(pixels) & (distance > 0)
         x, y = np.round(pixels[shown]).astype(int).T
-        found[shown] |= near[y, x] & (np.abs(depths[name][y, x] - distance[shown]) < SAME_SURFACE)
-    return found
+        beside[shown] |= near[y, x] & (np.abs(depths[name][y, x] - distance[shown]) < SAME_SURFACE)
+    return beside
 
 
 def _shots(
     capture: Capture, masks: Mapping[str, Masks], images: Images, device: str, depths: Mapping[str, np.ndarray]
 ) -> list[Shot]:
-    """Views of frame 0 to train on, with `depths` [H, W], m, by camera; a camera that does not show the object is left out."""
+    """Training views of frame 0, with `depths` [H, W], m, by camera; cameras that do not show the object are left out."""
     from neuspring.splats.draw import view_of
     from neuspring.splats.losses import HAND_MARGIN, REFERENCE_WIDTH, Shot
 
@@ -145,49 +145,49 @@ def _shots(
         margin = HAND_MARGIN * camera.width / REFERENCE_WIDTH
         seen = (capture.color(name, 0), labels == OBJECT, labels >= HANDS, depths[name])
         if (shot := Shot.of(name, view_of(camera, device), *seen, margin)) is None:
-            print(f"camera {name}: the object is not in view in frame 0; it does not train the appearance", flush=True)
+            print(f"camera {name}: the object is not visible in frame 0; this camera is not used for splats", flush=True)
         else:
             shots.append(shot)
     if not shots:
-        rule = "at least one camera must have the object in view in frame 0, away from hands"
-        raise InputError(f"{capture.folder}, masks of frame 0", rule, "empty masks", "Look at perception/<camera>/masks.png.")
+        rule = "at least one camera must show the object in frame 0, away from hands"
+        raise InputError(f"{capture.folder}, masks of frame 0", rule, "empty masks", "Check perception/<camera>/masks.png.")
     return shots
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """Points known of the object's surface in frame 0."""
+    """Known points of the object's surface in frame 0."""
 
     cloud: np.ndarray
-    """[P, 3] m, seen."""
+    """Observed points [P, 3], m."""
     colors: np.ndarray
-    """[P, 3] RGB."""
+    """RGB of the observed points [P, 3]."""
     prior: np.ndarray
-    """[Q, 3] m, on the surface that a shape prior guesses."""
+    """Points on the surface of the shape prior [Q, 3], m."""
     reach: float
-    """m: points of the prior this near to a seen one add nothing."""
+    """Distance, m, within which a point of the prior duplicates an observed point."""
     hidden: float | None
-    """Part of the surface that no camera saw, as perception's record has it; None where no prior says what the whole is."""
+    """Fraction of the surface that no camera saw, from the record of perception; None: unknown without a prior."""
 
     def first(self, start: Literal["seen", "shape_prior"]) -> tuple[np.ndarray, np.ndarray]:
-        """First centers of splats, [R, 3] m, and their RGB [R, 3]."""
+        """Centers of the initial splats [R, 3], m, and their RGB [R, 3]."""
         distance, nearest = self._to_cloud
         if start == "shape_prior" and self.has_prior:
             return self.prior, self.colors[nearest]
-        # What was seen, and where nothing was the prior, in the colors of what is nearest.
+        # Points of the prior complete the observed ones; they get the color of the nearest observed point.
         new = distance > self.reach
         return np.concatenate([self.cloud, self.prior[new]]), np.concatenate([self.colors, self.colors[nearest[new]]])
 
     @property
     def has_prior(self) -> bool:
-        """True where there are points enough of a prior for splats to begin with."""
+        """True if the prior has enough points to initialize splats."""
         from neuspring.splats.train import SCALE_NEIGHBORS
 
         return len(self.prior) > SCALE_NEIGHBORS
 
     @cached_property
     def _to_cloud(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distance, m, and index of the nearest seen point of each point of the prior [Q]."""
+        """Distance, m, and index of the nearest observed point for each point of the prior [Q]."""
         from scipy.spatial import cKDTree
 
         distance, nearest = cKDTree(self.cloud).query(self.prior)
@@ -203,7 +203,7 @@ def _surface(
     before: Before | None,
     observations: Observations | None,
 ) -> _Surface:
-    """From perception's record, or from masks and processed observations; `width`, m, is a pixel's at the object."""
+    """The surface from the record of perception, or from masks and processed observations; `width`: pixel width, m."""
     from neuspring.data.results import LiftedTracks, ShapePrior
     from neuspring.perception.lift import clean_masks
 
@@ -222,7 +222,7 @@ def _surface(
     require_length(capture, observations)
     _, cloud, colors = clean_masks(capture, masks, settings.perception.lift.neighborhood, frames=1)
     if not len(cloud):
-        raise InputError(capture.folder, "the object's masks of frame 0 must hold pixels with usable depth", "none")
+        raise InputError(capture.folder, "the object's masks of frame 0 must contain pixels with usable depth", "none")
     return _Surface(cloud, colors, observations.surface_points, NEAR_SEEN * width, None)
 
 
@@ -238,7 +238,7 @@ def _surface_points(prior: ShapePrior, apart: float, seed: int) -> np.ndarray:
 
 
 def _behind_hands(shot: Shot, drawn: np.ndarray) -> float:
-    """Part of the splats' picture that hands cover."""
+    """Fraction of the rendered splats that hands cover."""
     from neuspring.splats.draw import OBJECT_COVERAGE
 
     cover = drawn[..., 3] >= OBJECT_COVERAGE
@@ -256,11 +256,11 @@ def _quality(shot: Shot, drawn: np.ndarray) -> float:
 
 
 def _require_outside(capture: Capture, points: np.ndarray) -> None:
-    """A camera within the object's box sees nothing that could be right."""
+    """Raise InputError for a camera inside the object's bounding box, whose pose must be wrong."""
     low, high = points.min(axis=0), points.max(axis=0)
     for name, camera in capture.cameras.items():
         center = camera.camera_to_world[:3, 3]
         if ((center > low) & (center < high)).all():
-            rule = f"cameras.{name}.camera_to_world: the camera must stand outside the object"
-            remedy = "Poses are camera-to-world, meters; an inverted or unscaled one puts the camera elsewhere."
+            rule = f"cameras.{name}.camera_to_world: the camera must be outside the object"
+            remedy = "Poses are camera-to-world, in meters. Check for an inverted pose and for its unit."
             raise InputError(capture.folder / CAPTURE, rule, np.round(center, 3).tolist(), remedy)

@@ -1,4 +1,4 @@
-"""A synthetic scene, or PhysTwin's raw layout -> a capture folder."""
+"""Stage `capture`: a synthetic scene, or data in PhysTwin's raw layout -> a capture folder."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ from neuspring.stages.stage import stage, there
 def capture(scenario: ScenarioRow, settings: Config, output: Path) -> None:
     """Synthetic scene or PhysTwin's raw layout -> capture folder, whose capture.json is `output`.
 
-    The truth of a synthetic scene lies beside the folder and is never read by a method.
+    The truth of a synthetic scene is written next to the folder; no method reads it.
     """
     write_capture(scenario, settings, output.parent)

@@ -1,4 +1,4 @@
-"""Coarse twin -> fitted twin, by gradients through the simulator."""
+"""Stage `fit`: twin of a search -> fitted twin, with gradients through the simulator."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def _settled(rows: Rows) -> Config:
-    """The configuration; free springs have no field."""
+    """The configuration with default settings of the field for free springs, which have no field."""
     if rows.method is None or rows.method.fit != "springs":
         return rows.config
     return dataclasses.replace(rows.config, fit=dataclasses.replace(rows.config.fit, field=SpringFieldSettings()))
 
 
 def _alike(rows: Rows) -> tuple[Any, ...] | None:
-    """Frames per step, True for an oracle, which goes over all frames and not over those before the split alone, and the pool.
+    """Key of fits that can share launches: physics, frames per step, oracle (it uses all frames) and pool.
 
     None for a body that is fitted without gradients.
     """
@@ -37,7 +37,7 @@ def _alike(rows: Rows) -> tuple[Any, ...] | None:
 
 
 def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
-    """Several fits of one body; those of one physics and horizon share launches."""
+    """Run several fits of one body; fits with the same physics and horizon share launches."""
     tasks = []
     for job in jobs:
         problem, checkpoint, key = prepared(**{name: value for name, value in job.arguments.items() if name != "threads"})
@@ -45,9 +45,9 @@ def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
         tasks.append(FitTask(problem, checkpoint, key))
     results = body_of(tasks[0].problem.twin).fit_many(tasks)
     made: list[Written | Exception] = []
-    for job, task, one in zip(jobs, tasks, results, strict=True):
+    for job, task, result in zip(jobs, tasks, results, strict=True):
         assert task.partial is not None
-        made.append(one if isinstance(one, Exception) else written(job.record, one, task.partial))
+        made.append(result if isinstance(result, Exception) else written(job.record, result, task.partial))
     return made
 
 
@@ -72,23 +72,23 @@ def fit(
     settings: Config,
     run: Recorder,
     pool: Sequence[Observations] = (),
-    kind: Annotated[str, "springs: train each spring; field: the neural spring field; or a kind of another body"] = "springs",
-    oracle: Annotated[bool, "fit all frames, the future included: what fitting could reach at best"] = False,
+    kind: Annotated[str, "springs: every spring; field: the neural spring field; or a kind of another body"] = "springs",
+    oracle: Annotated[bool, "fit all frames, including future frames: the best that fitting can reach"] = False,
     device: str = "auto",
     threads: int = 1,
 ) -> Written:
-    """Coarse twin -> fitted twin, by gradients: twin.npz, history.parquet (losses per epoch).
+    """Twin of a search -> fitted twin, with gradients: twin.npz, history.parquet (losses per epoch).
 
-    A field's first weights follow the search's seed. An `oracle` fits all frames, the future included, and the record says so. With
-    a `pool` of other recordings the twin is fitted on all. A killed fit continues from its
-    checkpoint. Another body may do without gradients, on `threads` cores, and begins anew.
+    The seed of the search initializes a field's weights. An `oracle` fits all frames, including future frames, and is recorded
+    as such. With a `pool`, the twin is fitted on all of its recordings. A killed fit resumes from its checkpoint. Other bodies
+    may be fitted without gradients, on `threads` cores; such a fit starts over.
     """
     problem, checkpoint, key = prepared(observations, search, settings, run, pool, kind, oracle, device)
     return written(run, body_of(problem.twin).fit(problem, partial=checkpoint, key=key, threads=threads), checkpoint)
 
 
 def written(run: Recorder, result: Learned, checkpoint: Path) -> Written:
-    """The files of a fit."""
+    """Write the files of a fit."""
     from neuspring.core.files import write_history
 
     files = run.beside(twin="twin.npz", history="history.parquet")
@@ -109,7 +109,7 @@ def prepared(
     oracle: bool,
     device: str,
 ) -> tuple[FitProblem, Path, str]:
-    """A fit before it runs, where its checkpoints lie, and what a checkpoint must match. The search must not have failed."""
+    """The fit problem, the path of its checkpoint and the checkpoint's key. The search must not have failed."""
     from neuspring.core.artifacts import Twin
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.twin.fit import FitProblem
@@ -130,7 +130,7 @@ def prepared(
         seed=seed,
         oracle=oracle,
     )
-    # What was read, the search by its twin alone.
+    # Of the search, only its twin counts.
     inputs = {name: digest for name, digest in run.inputs.items() if name != "search"} | {"twin": search.record.files["twin"][1]}
     key = checkpoint_key(inputs, run.settings | {"seed": seed}, device, "neuspring.twin.fit")
     return problem, run.output.with_name("fit.partial.npz"), key

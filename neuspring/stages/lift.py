@@ -1,4 +1,4 @@
-"""Masks and tracks of all cameras -> points in the world, and a shape prior."""
+"""Stage `lift`: masks and tracks of all cameras -> 3D points and a shape prior."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from neuspring.stages.stage import Written, paths, stage
     also=lambda rows: [mesh] if (mesh := rows.config.perception.shape.mesh) else [],
 )
 def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], settings: Config, run: Recorder) -> Written:
-    """Masks and tracks of all cameras -> points in the world, shape prior: lifted.npz, shape.npz and lifted.png.
+    """Masks and tracks of all cameras -> 3D points, shape prior: lifted.npz, shape.npz and lifted.png.
 
-    The capture's `depth` names the lifter. Some write more: image.npz, what losses read of the image; depth.npz, a supposed depth
-    of frame 0; and images to look at.
+    The capture's `depth` selects the lifter. Some lifters also write image.npz (image observations for losses), depth.npz (an
+    estimated depth of frame 0) and figures.
     """
     from neuspring.core.files import write_npz
     from neuspring.core.findings import findings_as_facts
@@ -34,22 +34,22 @@ def lift(capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], se
     from neuspring.perception import figures
 
     masks_of, tracks_of = masks_of_cameras(capture, paths(masks)), tracks_of_cameras(capture, paths(tracks))
-    known = LIFTERS[capture.description.depth].lift(capture, masks_of, tracks_of, settings.perception)
-    lifted, prior = known.tracks, known.prior
-    # Whether its picture changes where no point is followed, `observe` cannot see.
+    result = LIFTERS[capture.description.depth].lift(capture, masks_of, tracks_of, settings.perception)
+    lifted, prior = result.tracks, result.prior
+    # `observe` reads no images, so it cannot see motion where no point is tracked.
     lifted.facts["object_moves"] = max(masks.facts.get("object_moves", 0.0) for masks in masks_of.values())
     files = run.beside(lifted="lifted.npz", shape="shape.npz", picture="lifted.png")
     lifted.save(files["lifted"])
     prior.save(files["shape"])
     figures.lifted_figure(lifted, prior, files["picture"])
-    if known.image is not None:
+    if result.image is not None:
         files |= run.beside(image="image.npz")
-        known.image.save(files["image"])
-    if known.depths:
+        result.image.save(files["image"])
+    if result.depths:
         files |= run.beside(depth="depth.npz")
-        write_npz(files["depth"], known.depths, "{}", compress=True)
-    for name, image in known.pictures.items():
+        write_npz(files["depth"], result.depths, "{}", compress=True)
+    for name, image in result.pictures.items():
         files |= run.beside(**{name: f"{name}.png"})
         write_png(files[name], image)
     facts = lifted.facts | {"shape": prior.backend} | {f"shape_{name}": value for name, value in prior.facts.items()}
-    return Written(files=files, facts=facts | findings_as_facts(known.findings))
+    return Written(files=files, facts=facts | findings_as_facts(result.findings))

@@ -1,4 +1,4 @@
-"""A capture, or processed data -> observations.npz."""
+"""Stage `observe`: a capture, or processed data -> observations.npz."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from neuspring.stages.stage import stage, there
 def observe(
     scenario: ScenarioRow, settings: Config, output: Path, capture: Capture | None = None, lifted: Before | None = None
 ) -> None:
-    """Capture, or processed data -> observations.npz; of a toy scene also truth.npz beside it, which no method reads.
+    """Capture, or processed data -> observations.npz; for a toy scene also truth.npz, which no method reads.
 
-    Raw video has been perceived before: `capture` and `lifted` are what came of it. Then a record with what was noticed lies beside
-    the observations. Raises InputError for observations that no method can work with.
+    For raw video, `capture` and `lifted` are the results of perception, and a record with findings is written next to the
+    observations. Raises InputError for observations that no method can use.
     """
     if not SOURCES[scenario.source].films:
         read_observations(scenario, settings, output).save(output)
         return
     if capture is None or lifted is None:
-        rule = f"scenarios of source {scenario.source} need --capture and --lifted"
+        rule = f"source {scenario.source} requires --capture and --lifted"
         raise InputError(f"scenario {scenario.scenario}", rule, "neither", "Run neuspring capture, segment, track and lift first.")
     from neuspring.checks.perceived import look_at_observations
     from neuspring.core.artifacts import ImageObservations
@@ -48,9 +48,9 @@ def observe(
     observations = assemble(scenario, capture, points, prior, settings.perception, image)
     findings = look_at_observations(observations, points.facts.get("object_moves", 0.0))
     facts = findings_as_facts(findings)
-    # Before the observations are there: what no method can work with starts no search.
+    # Unusable observations must not be saved, because a search would start from them.
     refuse_errors(findings)
     observations.save(output)
-    # A capture of the user's own lies outside of the results: what draws the scenario finds it by this.
+    # A user's capture is outside of the results folder; figures find it through this fact.
     here = {CAPTURE_FOLDER: str(capture.folder.absolute())}
     record.save({"observations": output}, {"nodes": len(observations.nodes), **here, **facts})

@@ -1,4 +1,4 @@
-"""The model of a baseline and the controllers of all frames -> trajectory."""
+"""Stage `predict`: the model of a baseline and the controllers of all frames -> trajectory."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def predict(
     appearance: Before | None = None,
     device: str = "auto",
 ) -> Written:
-    """Model of a baseline -> trajectory over all frames: trajectory.npz, and centers.npz of models with splats of their own.
+    """Model of a baseline -> trajectory over all frames: trajectory.npz, and centers.npz for models with their own splats.
 
-    A model whose training failed is rolled out too, and the run remains a failure. Raises InputError if the record of a training is
-    missing.
+    A model whose training failed is also rolled out, but the run remains a failure. Raises InputError if the record of a required
+    training is missing.
     """
     from neuspring.splats.model import Splats
 
     if model not in BASELINES:
         raise InputError("--model", f"must be one of {', '.join(BASELINES)}", model)
     if BASELINES[model].trained and train is None:
-        raise InputError("--train", f"model {model} is trained first", None, "Name its train.json.")
+        raise InputError("--train", f"model {model} requires a training", None, "Name its train.json.")
     if train and train.record.status == "failed" and not train.has("model"):
         # A failed training may have left its last usable model.
         raise NumericalFailure(f"train: {train.record.reason}")
@@ -62,9 +62,9 @@ def predict(
 
 
 def _scores_of_centers(centers: np.ndarray, observations: Observations) -> dict[str, float]:
-    """Chamfer distance, m, of the centers [F, G, 3] of all splats, in the tasks whose frames they reach.
+    """Chamfer distance, m, of all splat centers [F, G, 3], for tasks whose frames they cover.
 
-    The released evaluation takes the first of them in storage order, which is an arbitrary part.
+    The released evaluation uses only the first centers in storage order, an arbitrary subset.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Move splats along a trajectory, draw every frame, score it, write videos."""
+"""Stage `render`: move splats along a trajectory, render and score every frame, write videos."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RENDERED_VIDEOS = ("video", "turntable")
 
 
 def _weights(rows: Rows) -> str:
-    """Optional weights, without which one metric is left out."""
+    """Whether the optional weights of LPIPS are available."""
     from neuspring.scores.lpips import find_weights
 
     return "absent" if isinstance(find_weights(), str) else "found"
@@ -48,9 +48,10 @@ def render(
     run: Recorder,
     device: str = "auto",
 ) -> Written:
-    """Splats and trajectory -> pictures, scored and filmed: frames.parquet (metrics per frame and camera), images.png, videos.
+    """Splats and trajectory -> rendered images, scored: frames.parquet (metrics per frame and camera), images.png, videos.
 
-    A trajectory that diverged is shown as far as it goes; its last frame is frozen and scored on, for averages over all runs.
+    Figures and videos of a diverged trajectory end at its last frame. Scores repeat that frame to the end, so that averages over
+    all runs include it.
     """
     import numpy as np
     import pandas as pd
@@ -108,16 +109,16 @@ def render(
         "splats": len(splats.means),
         "lpips": lpips if isinstance(lpips, str) else "computed",
         "unseen_surface": appearance.record.facts["unseen_surface"],
-        # Nothing but black on both sides: such frames have no finite PSNR.
+        # Frames in which both images are black have no finite PSNR.
         "empty_frames": int(np.isinf(table.loc[table["frame"] < predicted, "value"]).sum()),
     }
     return Written(files=files, facts=facts, failure=rollout.record.reason)
 
 
 def posed(appearance: Before, rollout: Before, trajectory: Trajectory, device: str) -> tuple[Splats, Iterator[Gaussians]]:
-    """Splats of frame 0, and in every frame: where the method's own model puts them, else skinned to the trajectory.
+    """Splats of frame 0 and of every frame: predicted by the method's own model, or skinned to the trajectory.
 
-    Raises NumericalFailure where no splat is opaque enough to be moved.
+    Raises NumericalFailure if no splat is opaque enough to be skinned.
     """
     from neuspring.splats.draw import frames_from_centers, prune_by_opacity, skinned_frames
     from neuspring.splats.model import Splats
@@ -130,7 +131,7 @@ def posed(appearance: Before, rollout: Before, trajectory: Trajectory, device: s
 
 
 def _frozen_at_end(frames: Iterator[Gaussians], count: int) -> Iterator[Gaussians]:
-    """`count` frames: the last one again and again where there are fewer."""
+    """Yield `count` frames; missing frames repeat the last one."""
     last = None
     for last in itertools.islice(frames, count):
         count -= 1
@@ -150,9 +151,9 @@ def draw_frames(
     device: str,
     output: Path,
 ) -> list[Path]:
-    """RGBA pictures <frame>.png (five digits) of a prediction, seen by one camera, in the folder `output`; all frames by default.
+    """Render frames of a prediction (default: all) from one camera as RGBA images <frame>.png, five digits, in folder `output`.
 
-    Raises InputError for a camera or frame that is not there, and where there is nothing to draw.
+    Raises InputError for an unknown camera or frame, and for an empty trajectory.
     """
     from neuspring.core.device import resolve_device
     from neuspring.data.frames import write_png

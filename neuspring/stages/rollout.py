@@ -1,4 +1,4 @@
-"""Twin and controllers of all frames -> trajectory."""
+"""Stage `rollout`: a twin and the controllers of all frames -> trajectory."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from neuspring.twin.body import body_of, code
 def rollout(observations: Observations, learned: Before, run: Recorder, device: str = "auto") -> Written:
     """Twin -> trajectory over all frames, trajectory.npz. A rollout that diverges is recorded as a failure.
 
-    `learned` is the search.json or fit.json that names the twin. A twin that saw the future is called `oracle`. A body that can
-    meet itself takes more substeps (`Body.for_prediction`).
+    `learned` is the search.json or fit.json of the twin. The record of a twin fitted on future frames contains `oracle`. Objects
+    with self-collision use more substeps (`Body.for_prediction`).
     """
     from neuspring.twin.rollout import initial_velocity, roll_out
 
@@ -31,7 +31,7 @@ def rollout(observations: Observations, learned: Before, run: Recorder, device: 
     velocity = initial_velocity(observations, twin.simulation.initial_velocity)
     trajectory = roll_out(twin, observations.controller_points, device, velocity=velocity, valid=observations.controller_valid)
     if trajectory.collision_overflow:
-        print("warning: collision candidates did not fit the list; raise simulation.collision_capacity")
+        print("warning: the collision list overflowed, so some contacts are missing; increase simulation.collision_capacity")
     files = run.beside(trajectory="trajectory.npz")
     trajectory.save(files["trajectory"])
     facts = {

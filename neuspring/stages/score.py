@@ -1,4 +1,4 @@
-"""Trajectory -> scores, plots and run.json, the record of the whole run."""
+"""Stage `score`: trajectory -> scores, plots and run.json, the record of the run."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from neuspring.stages.stage import MayFail, Rows, stage
 from neuspring.twin.body import code, lines_of
 
 PICTURE_ROLES = ("strip", "video", "turntable")
-"""Files of the render stage to look at."""
+"""Figures and videos of stage `render`."""
 PICTURE_FACTS = ("backend", "masks", "views", "lpips", "unseen_surface")
-"""Facts that a reader of image scores must know."""
+"""Facts that a reader of image scores needs."""
 
 NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "start": (lambda v: str(v).startswith("seen:"), "without a shape prior, splats begin where something was seen"),
@@ -33,29 +33,29 @@ NOTED: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda v: v > SHARE_AT_BOUND,
         "{at_bound:.0%} of the springs lie at the bound of their stiffness (fit.output_bound)",
     ),
-    # Where more are left out, gradients say little about long motions.
+    # Above this fraction, gradients contain little about long motions.
     "frames_left_out": (lambda v: v > 0.05, "{frames_left_out:.0%} of the frames left out of gradients"),
-    # Where fewer moved, the settings were in training's way.
+    # Below this fraction, settings have prevented the training of the planes.
     "texels_moved": (lambda v: v < 0.05, "only {texels_moved:.1%} of the texels moved by a tenth of their first scale"),
 }
-"""Facts of a stage's record, when they are worth a note, and the note."""
+"""Fact of a stage's record -> whether it requires a note, and the note."""
 
 
 def _variant(rows: Rows) -> dict[str, Any]:
-    """The switches of a method, for the record of its run."""
+    """The method's search, fit and own settings, for the record of its run."""
     if rows.method is None:
         return {}
-    own: dict[str, Any] = plain(rows.method)["settings"]
+    settings: dict[str, Any] = plain(rows.method)["settings"]
     if rows.search is None:
         kind = {"mean_of": rows.method.mean_of} if rows.method.mean_of else {"model": rows.method.model}
-        return {"variant": kind | own}
+        return {"variant": kind | settings}
     switches: dict[str, Any] = {"search": rows.method.search, "clusters": rows.search.clusters, "fit": rows.method.fit or "none"}
     switches |= {"pool": rows.method.pool} if rows.method.pool else {}
-    # Named only where it is one: runs of other rows are compared with it nowhere.
+    # Only oracles have this key; they are excluded from comparisons.
     switches |= {"oracle": True} if rows.method.oracle else {}
     quirks = rows.search.released_quirks
     switches |= {"released_quirks": sorted(key for key, on in quirks.items() if on)} if quirks else {}
-    return {"variant": switches | own}
+    return {"variant": switches | settings}
 
 
 @stage(output="{scenario}/{method}/{seed}/run.json", rule="run", code=lambda settings, given: code(), given=_variant)
@@ -72,11 +72,11 @@ def score(
     variant: dict[str, Any] | None = None,
     seed: int = 0,
 ) -> None:
-    """Trajectory -> scores, plots and run.json, the record of the whole run, which MLflow indexes.
+    """Trajectory -> scores, plots and run.json, the record of the run, which MLflow indexes.
 
-    The records are those of the method's stages: search and fit, or train, if any; rollout; of scenarios with images, appearance
-    and render. `variant` are the method's switches. A run that failed also gets held.parquet: its scores with the last frame frozen
-    that it reached.
+    Inputs are the records of the method's stages: rollout; search and fit, or train, if they exist; for scenarios with images
+    appearance and render. `variant` contains the method's own settings. For a failed run, held.parquet contains the scores with
+    its last frame repeated to the end.
     """
     import pandas as pd
 
@@ -135,7 +135,7 @@ def score(
         params |= {name: record.settings, f"{name}.result": record.facts}
     RunRecord(
         **content,
-        # Why LPIPS was not computed names places on this machine: beside the content, not in it.
+        # Outside of `content`: the reason why LPIPS was not computed contains paths of this machine.
         images=_picture_facts(records),
         floors=metrics.floors(observations),
         run_key=key_of(content, stages.results | {"scores": digest_file(folder / "scores.parquet")}),
@@ -159,7 +159,7 @@ def score(
 
 
 def _picture_facts(records: Mapping[str, StageRecord]) -> dict[str, Any] | None:
-    """The way pictures were scored, or the reason why they were not; None for scenarios without images."""
+    """How images were scored, or why they were not; None for scenarios without images."""
     if "render" not in records:
         return None
     facts = records["render"].facts

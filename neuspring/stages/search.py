@@ -1,4 +1,4 @@
-"""Observations -> coarse twin, by CMA-ES."""
+"""Stage `search`: observations -> twin, with CMA-ES."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ READS = ("search", "simulation", "losses", "released_quirks")
 
 
 def _settled(rows: Rows) -> Config:
-    """The configuration; a body of one region has none to tie."""
+    """The configuration with default `tied_rollouts` for one region, which has no regions to tie."""
     if rows.search is None or rows.search.clusters != 1:
         return rows.config
     return dataclasses.replace(rows.config, search=dataclasses.replace(rows.config.search, tied_rollouts=Search().tied_rollouts))
@@ -30,13 +30,16 @@ def _given(rows: Rows) -> dict[str, Any]:
 
 
 def _alike(rows: Rows) -> tuple[Any, ...] | None:
-    """None for a body whose search has no launches to share; those of one number of candidates end at about the same time."""
+    """Key of searches that can share launches; with equal budgets they end at about the same time.
+
+    None for a body whose search has no launches.
+    """
     search = rows.search
     return (*physics(rows), search.body, rows.config.search.rollouts) if search and BODIES[search.body].by_gradients else None
 
 
 def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
-    """Several searches of one body, whose generations share launches."""
+    """Run several searches of one body, whose generations share launches."""
     tasks = []
     for job in jobs:
         given = job.arguments
@@ -44,7 +47,7 @@ def _many(jobs: Sequence[Job]) -> list[Written | Exception]:
         options = prepared(**{name: given[name] for name in names}, threads=1)
         tasks.append(SearchTask(given["observations"], given["pool"] or (), given["settings"], options))
     results = BODIES[jobs[0].arguments["body"]].search_many(tasks)
-    return [one if isinstance(one, Exception) else written(job.record, one) for job, one in zip(jobs, results, strict=True)]
+    return [made if isinstance(made, Exception) else written(job.record, made) for job, made in zip(jobs, results, strict=True)]
 
 
 @stage(
@@ -66,26 +69,28 @@ def search(
     run: Recorder,
     pool: Sequence[Observations] = (),
     clusters: int = 1,
-    body: Annotated[str, "lattice, or a package's own"] = "lattice",
+    body: Annotated[str, "lattice, or the body of a package"] = "lattice",
     seed: int = 0,
     device: str = "auto",
     threads: int = 1,
     twins_per_launch: int | Literal["auto"] = "auto",
 ) -> Written:
-    """Observations -> coarse twin, by CMA-ES: twin.npz, trace.parquet (every candidate with cost and variables), history.parquet.
+    """Observations -> twin, with CMA-ES: twin.npz, trace.parquet (all candidates with cost and variables), history.parquet.
 
-    `clusters` regions of the topology have values of their own (1: uniform). At most `twins_per_launch` candidates share a launch
-    (auto: as many as pay), and `threads` launches run at the same time on a CPU; neither changes a number there. A trace of the
-    same search is continued, so a larger `search.rollouts` costs only the difference. With a `pool` of other recordings a
-    candidate's cost is the mean over all. A `body` of a package
-    may search in another way, and have other rows in its trace.
+    - `clusters`: number of regions with their own values; 1: uniform.
+    - `twins_per_launch`: maximum number of candidates per launch; auto: the fastest number. On a CPU, `threads` launches run at
+      the same time, and neither option changes a result.
+    - `pool`: other recordings; the cost of a candidate is the mean over all recordings.
+    - `body`: the body of a package may use another search and other columns in its trace.
+
+    The search resumes from its trace, so increasing `search.rollouts` costs only the additional rollouts.
     """
     options = prepared(settings, run, clusters, seed, device, threads, twins_per_launch)
     return written(run, BODIES[body].search(observations, pool, settings, options))
 
 
 def written(run: Recorder, result: Learned) -> Written:
-    """The files of a search."""
+    """Write the files of a search."""
     from neuspring.core.files import write_history
 
     files = run.beside(twin="twin.npz", trace="trace.parquet", history="history.parquet")
@@ -103,12 +108,12 @@ def prepared(
     threads: int,
     twins_per_launch: int | Literal["auto"],
 ) -> SearchOptions:
-    """The way a search runs, where its trace lies, and what one must match to be continued. Raises InputError."""
+    """Options of a search, with the path of its trace and the trace's key. Raises InputError."""
     from neuspring.core.checkpoint import checkpoint_key
 
     if threads < 1:
         raise InputError("--threads", "must be at least 1", threads)
-    # The budget is not part of the key: a search with a larger one begins with the same candidates.
+    # The key excludes the budget: a search with a larger budget starts with the same candidates.
     without_budget = {name: value for name, value in run.settings["search"].items() if name != "rollouts"}
     return SearchOptions(
         clusters=clusters,
@@ -122,7 +127,7 @@ def prepared(
 
 
 def launch_size(twins_per_launch: int | Literal["auto"]) -> int:
-    """Twins that share a launch at most; 0: as many as are fast on the device. Raises InputError."""
+    """Maximum number of twins per launch; 0: the fastest number on the device. Raises InputError."""
     if twins_per_launch == "auto":
         return 0
     if not isinstance(twins_per_launch, int) or twins_per_launch < 1:

@@ -1,4 +1,4 @@
-"""One camera of a capture -> masks of object and hands."""
+"""Stage `segment`: one camera of a capture -> masks of object and hands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neuspring.stages.stage import Rows, Written, stage
 
 
 def _settled(rows: Rows) -> Config:
-    """The configuration; processed data have masks, and those are taken, whatever segments raw video."""
+    """The configuration with backend `given` for processed data, which contain masks."""
     if rows.source.films:
         return rows.config
     perception = rows.config.perception

@@ -1,26 +1,26 @@
-"""A stage of the workflow: one typed function.
+"""A stage of the workflow: one typed function with declarations.
 
-The signature says what it reads, and from it and the decorator `stage` everything else follows: the command and its options, the
-rule, the digests of the inputs and the settings in the record, the passing on of failures.
+The signature and the decorator `stage` define everything else: the command with its options, the rule, the input digests and
+settings in the record, and how failures are passed on.
 
-| a parameter of type | is |
+| type of a parameter | meaning |
 |---|---|
-| `Observations`, `Capture` | a file of an earlier stage, which the function gets loaded |
-| `Before` | the record of an earlier stage; one that failed ends this stage with the same reason, unless it is `MayFail` |
-| a sequence of these | such files of all cameras, or of several recordings |
-| anything else | an option of the command, which stands in the record |
+| `Observations`, `Capture` | a file of an earlier stage, passed to the function as a loaded object |
+| `Before` | the record of an earlier stage; if that stage failed, this one fails with the same reason, except for `MayFail` |
+| a sequence of these | the files of all cameras, or of several recordings |
+| any other type | an option of the command, stored in the record |
 
-| a parameter named | is |
+| name of a parameter | meaning |
 |---|---|
-| `settings` | the `Config`: the keys of `reads` are given to the rule and stand in the record |
-| `run` | the `Recorder` of the record to be; a stage without one writes its product, its parameter `output`, beside its record |
-| `device`, `threads`, `twins_per_launch` | where and how it runs, which changes no result and stands in no record |
+| `settings` | the `Config`; the keys in `reads` are passed to the rule and stored in the record |
+| `run` | the `Recorder` of the stage's record; a stage without it writes its product to its parameter `output` |
+| `device`, `threads`, `twins_per_launch` | where and how the stage runs; they change no result and are not stored |
 
-An input has the name of the file that it is: `masks` is the masks.json that stage `segment` writes, `search` a search.json. One
-that is a sequence of observations has the name of a field of `Rows`, which lists the recordings: `pool`, `targets`.
+An input has the name of its file: `masks` is the masks.json of stage `segment`, `search` a search.json. A sequence of
+observations has the name of the field of `Rows` that lists the recordings: `pool` or `targets`.
 
-The workflow asks the declarations of a stage with the `Rows` behind a job: where there are such jobs, which inputs one goes
-without, what the tables tell its options, which rule's jobs run it. It knows no stage by name.
+The workflow evaluates a stage's declarations with the `Rows` of a job: whether the job exists, which inputs it omits, the values
+of its options, and the rule that runs it.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ if TYPE_CHECKING:
     from neuspring.scenes.sources import Source
 
 PLACES = ("device", "threads", "twins_per_launch")
-"""Parameters that say where and how a stage runs."""
+"""Parameters that define where and how a stage runs."""
 LOADERS: dict[Any, Callable[[Path], Any]] = {
     Observations: Observations.load,
     Capture: lambda path: Capture.load(path.parent),
     Before: Before.load,
 }
-"""Reader of a file of each type of input."""
+"""Type of an input -> reader of its file."""
 MAY_FAIL = "may have failed"
 MayFail = Annotated[Before, MAY_FAIL]
-"""A record that the function wants also of a stage that failed."""
-SETTINGS_HELP = "JSON, or YAML files separated by commas; defaults otherwise"
+"""The record of a stage that may have failed."""
+SETTINGS_HELP = "JSON, or YAML files separated by commas; without it, the defaults"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,38 +69,38 @@ class Written:
     """The results of a stage, for its record."""
 
     files: Mapping[str, Path] = field(default_factory=dict)
-    """Role -> file beside the record."""
+    """Role -> file in the record's folder."""
     facts: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers and text worth keeping."""
+    """Results as numbers and text."""
     failure: str = ""
-    """Why the stage failed, where it left files nevertheless."""
+    """Why the stage failed, if it failed with files."""
     attempts: int = 1
     earlier_seconds: float = 0.0
-    """Seconds of the attempts that it continued."""
+    """Duration of the attempts from whose checkpoints it resumed, s."""
     checkpoint: Path | None = None
-    """No longer needed once the record is there."""
+    """Checkpoint to delete after the record is written."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a stage: an input file, an option, or where it runs."""
+    """A parameter of a stage: an input file, an option, or one of `PLACES`."""
 
     type: Any
-    """Type of its value, or of the entries of a sequence; without what says that it may be left out."""
+    """Type of the value, or of the entries of a sequence, without `None`."""
     many: bool
     """True for a sequence."""
     default: Any
     note: str
-    """The text beside the type, for the help of the command."""
+    """The annotation of the type, which is the help text of the command."""
 
     @property
     def is_input(self) -> bool:
-        """True for names of files."""
+        """True for an input file."""
         return self.type in LOADERS
 
     @property
     def required(self) -> bool:
-        """True where it must be given."""
+        """True without a default."""
         return self.default is inspect.Parameter.empty
 
 
@@ -109,34 +109,34 @@ _stamps = functools.cache(image_stamps)
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """The rows of a benchmark's tables behind a job: what declarations of its stage are asked with."""
+    """The table rows of a job, with which the declarations of its stage are evaluated."""
 
     config: Config
-    """With the settings of the method and of the search on top."""
+    """The configuration, overridden by the settings of the method and of the search."""
     scenario: ScenarioRow
     source: Source
     data: Path | None
-    """Folder or file of the scenario's data; None for scenes that are made here."""
+    """Folder or file of the scenario's data; None for simulated scenes."""
     images: bool
-    """True where predictions are drawn and scored."""
+    """True if predictions are rendered and scored."""
     method: Method | None = None
-    """The row of the wildcard `method`, or of `looks`; None where a job belongs to no method."""
+    """The method of the wildcard `method` or `looks`; None for a job that all methods share."""
     search: SearchRow | None = None
-    """The row of the wildcard `search`, or of the method; None for models of baselines."""
+    """The search of the wildcard `search`, or of the method; None for models of baselines."""
     pool: tuple[str, ...] = ()
-    """The other recordings of the pool, of a method that has one."""
+    """The other recordings of the pool, for methods with a pool."""
     targets: tuple[str, ...] = ()
     """Recordings to which the scenario's models are transferred."""
 
     @property
     def image_stamps(self) -> str:
-        """A digest that tells changed images of the user's apart; empty where images are made here, or there are none."""
+        """A digest that changes with the user's images; empty for simulated images and without images."""
         return _stamps(self.data) if self.data and (self.source.films or self.source.capture_files) else ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A stage with everything that it was given; its record is begun."""
+    """One call of a stage: its inputs, options and settings, and the `Recorder` that measures it."""
 
     stage: Stage
     output: Path
@@ -149,28 +149,28 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """True where the result is there, made of the same inputs, settings and code."""
+        """True if the result exists and was made from the same inputs, settings and code."""
         return self.output.exists() and self.record.agrees()
 
     @functools.cached_property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the function, with the inputs loaded. Raises InputError for what is damaged."""
+        """Arguments of the function, with loaded inputs. Raises InputError for damaged files."""
         values = dict(self.values)
         for name, parameter in self.stage.inputs.items():
             loaded = [LOADERS[parameter.type](path) for path in self.files[name]]
             values[name] = loaded if parameter.many else loaded[0] if loaded else None
-        own = {"settings": self.settings, "run": self.record, "output": self.output}
-        return values | {name: value for name, value in own.items() if name in self.stage.signature}
+        special = {"settings": self.settings, "run": self.record, "output": self.output}
+        return values | {name: value for name, value in special.items() if name in self.stage.signature}
 
     @property
     def failed(self) -> Before | None:
-        """The first input whose failure is passed on."""
+        """The first required input that failed, whose failure is passed on."""
         required = [n for n, p in self.stage.inputs.items() if p.type is Before and p.note != MAY_FAIL]
-        before = [Before.load(path) for name in required for path in self.files[name]]
-        return next((one for one in before if one.record.status == "failed"), None)
+        inputs = [Before.load(path) for name in required for path in self.files[name]]
+        return next((before for before in inputs if before.record.status == "failed"), None)
 
     def run(self) -> None:
-        """Run the function, and write the record. A numerical failure is recorded, its own or that of an earlier stage."""
+        """Run the function and write the record, also for a numerical failure of this or an earlier stage."""
         reset_opencv()
         if "run" not in self.stage.signature:
             self.stage.function(**self.arguments)
@@ -185,7 +185,7 @@ class Job:
                 self.record.save(failure=str(failure))
 
     def keep(self, made: Written) -> None:
-        """Write the record of these results."""
+        """Write the record of these results and delete the checkpoint."""
         self.record.save(made.files, made.facts, failure=made.failure, attempts=made.attempts, earlier_seconds=made.earlier_seconds)
         if made.checkpoint:
             made.checkpoint.unlink(missing_ok=True)
@@ -197,43 +197,43 @@ class Stage:
 
     function: Callable[..., Any]
     output: str
-    """The file that it writes below the results folder, with the job's wildcards."""
+    """The file that it writes in the results folder, with the wildcards of the job."""
     reads: tuple[str, ...] | Callable[[Config, Mapping[str, Any]], Sequence[str]] = ()
-    """Keys of the settings that it reads; or from the settings and the values of all parameters to these keys."""
+    """Keys of the settings that it reads, or a function of the settings and all parameters that returns them."""
     code: Callable[[Config, Mapping[str, Any]], Sequence[str]] = lambda settings, values: ()
     """Modules that it imports by name: backends, readers, baselines."""
     gpu: bool | Callable[[Config], bool] = False
-    """True where its jobs take a GPU if there is one; or from the settings."""
+    """Whether its jobs use a GPU if there is one, or a function of the settings."""
     memory_mb: int = 4000
     minutes: int = 30
-    """Memory and time that its first jobs ask for, before any was measured."""
+    """Requested memory and time of its jobs at the first attempt."""
     when: Callable[[Rows], bool] = lambda rows: True
-    """True where there is such a job."""
+    """Whether the job exists."""
     instead: Callable[[Rows], Path | None] = lambda rows: None
-    """The user's file that later stages take where there is no such job."""
+    """The user's file that later stages read if the job does not exist."""
     without: Callable[[Rows], Collection[str]] = lambda rows: ()
-    """Inputs that a job goes without."""
+    """Inputs that the job omits."""
     given: Callable[[Rows], Mapping[str, Any]] = lambda rows: {}
-    """Options whose values stand in rows; others are wildcards, or have the default of the signature."""
+    """Options whose values come from rows; the others are wildcards or have the default of the signature."""
     settled: Callable[[Rows], Config] = lambda rows: rows.config
-    """The configuration with defaults for what such a job does not read, so that a change of it runs nothing again."""
+    """The configuration, with defaults for settings that the job does not use: changing these does not repeat it."""
     also: Callable[[Rows], Iterable[Path]] = lambda rows: ()
-    """Files without which a job cannot run, or whose change runs it again, and which its command does not name."""
+    """Further files that the job requires, or whose change repeats it, and that its command does not name."""
     stamp: Callable[[Rows], str] = lambda rows: ""
-    """Text that makes a job run again and stands in no record: images that a capture is made of, weights that are there."""
+    """Text whose change repeats the job and that is not recorded: stamps of images, available weights."""
     shared: Callable[[Config, Method], Any] | None = None
-    """From a method and its configuration, what its result depends on: methods with the same share the job of the first one in the
-    table. None: it has no such job, or, without this declaration, each method has its own."""
+    """Key of the result, from a method and its configuration: methods with equal keys share the job of the first of them in the
+    method table. A key None: the method has no such job. Without this declaration, every method has its own job."""
     rule: str = ""
-    """The rule whose jobs run it, with other stages; empty: one of its own name."""
+    """The rule whose jobs run it, together with other stages; empty: the rule of its own name."""
     alike: Callable[[Rows], Any] | None = None
-    """Jobs of equal key can share launches in a batch; None: no others can."""
+    """Jobs with equal keys can share launches in a batch; a key None: no batch."""
     least_on_cpu: int | None = None
-    """Members of a batch on a CPU, at least, which are of one scenario; None: there are no batches on a CPU."""
+    """Minimum size of a batch on a CPU, where a batch contains one scenario; None: no batches on a CPU."""
     many: Callable[[Sequence[Job]], Sequence[Written | Exception]] | None = None
-    """Runs a batch: what each job made, or the error that ended it."""
+    """Runs a batch; returns the results of each job, or its error."""
 
-    # --- what it declares
+    # --- declarations
 
     @property
     def name(self) -> str:
@@ -242,17 +242,17 @@ class Stage:
 
     @property
     def about(self) -> str:
-        """Its products and inputs, in a line."""
+        """Its inputs and products, in one line."""
         return re.split(r": |\.?\n|\.$", inspect.getdoc(self.function) or "")[0]
 
     @functools.cached_property
     def product(self) -> str:
-        """The name under which later stages take what it writes."""
+        """The name of the input with which later stages read its output."""
         return Path(self.output).stem
 
     @functools.cached_property
     def wildcards(self) -> tuple[str, ...]:
-        """Names that tell its jobs apart."""
+        """Names that distinguish its jobs."""
         return tuple(re.findall(r"{(\w+)}", self.output))
 
     @property
@@ -262,13 +262,13 @@ class Stage:
 
     @functools.cached_property
     def signature(self) -> Mapping[str, inspect.Parameter]:
-        """The parameters of the function, as Python has them."""
+        """The parameters of the function, from `inspect`."""
         return inspect.signature(self.function).parameters
 
     @functools.cached_property
     def parameters(self) -> dict[str, Parameter]:
-        """All parameters but the settings and the record."""
-        hints, found = typing.get_type_hints(self.function, include_extras=True), {}
+        """All parameters except `settings` and `run`."""
+        hints, parameters = typing.get_type_hints(self.function, include_extras=True), {}
         for name, declared in self.signature.items():
             if name in ("settings", "run"):
                 continue
@@ -282,40 +282,40 @@ class Stage:
             if many:
                 hint = typing.get_args(hint)[0]
             kind = dict if typing.get_origin(hint) is dict else hint
-            found[name] = Parameter(kind, many, declared.default, note)
-        return found
+            parameters[name] = Parameter(kind, many, declared.default, note)
+        return parameters
 
     @functools.cached_property
     def inputs(self) -> dict[str, Parameter]:
-        """The files that it reads."""
+        """Parameters that are input files."""
         return {name: parameter for name, parameter in self.parameters.items() if parameter.is_input}
 
     @functools.cached_property
     def options(self) -> dict[str, Parameter]:
-        """Parameters beside files and settings."""
+        """Parameters that are options of the command."""
         return {n: p for n, p in self.parameters.items() if not p.is_input and n not in (*PLACES, "output")}
 
     @functools.cached_property
     def places(self) -> tuple[str, ...]:
-        """Those of `PLACES` that it takes."""
+        """Its parameters in `PLACES`."""
         return tuple(name for name in PLACES if name in self.parameters)
 
     def record_of(self, output: Path) -> Path:
-        """Place of the record of a job that writes `output`: there, or beside a product that is no record."""
+        """Path of the record of a job that writes `output`: that file, or one next to a product that is not a record."""
         return output if "run" in self.signature else output.with_name(f"{self.name}.record.json")
 
     def code_of(self, values: Config, given: Mapping[str, Any]) -> str:
-        """The digest of the code that makes it, given these values of its parameters."""
+        """The digest of its code for these settings and parameters."""
         return code_digest(self.function.__module__, *self.code(values, given))
 
     def settings(self, values: Config, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The part of the settings that the stage reads, given these values of its parameters."""
+        """The settings that it reads for these values of its parameters."""
         return select(values, self.reads(values, given) if callable(self.reads) else self.reads)
 
-    # --- how it runs
+    # --- execution
 
     def job(self, *, output: Path, settings: Config | None = None, **given: Any) -> Job:
-        """Digest the inputs and begin the record. Raises InputError for what is missing or unknown."""
+        """Digest the inputs and start the record. Raises InputError for missing and unknown parameters."""
         unknown = sorted(given.keys() - self.parameters.keys())
         missing = [n for n, p in self.parameters.items() if p.required and n not in given and n != "output"]
         if unknown or missing:
@@ -336,20 +336,20 @@ class Stage:
         read, code = self.settings(chosen, values) | options, self.code_of(chosen, values)
         device = values.get("device", "cpu")
         record = Recorder(self.name, self.record_of(output), inputs=roles, settings=read, device=device, code=code)
-        for path in (files[name][0].parent for name, one in self.inputs.items() if one.type is Capture and files[name]):
-            # Of images that stage `capture` made, its record says all; a user's may change.
+        for path in (files[name][0].parent for name, item in self.inputs.items() if item.type is Capture and files[name]):
+            # The record of stage `capture` covers the images that it made; a user's images may change.
             if not (path / "capture.record.json").exists():
                 record.inputs["images"] = image_stamps(path)
         return Job(stage=self, output=output, settings=chosen, values=values, files=files, record=record)
 
     def __call__(self, *, output: Path, settings: Config | None = None, **given: Any) -> None:
-        """Run it, and write its record."""
+        """Run the stage and write its record."""
         self.job(output=output, settings=settings, **given).run()
 
     # --- its command
 
     def parse(self, words: Sequence[str]) -> dict[str, Any]:
-        """Values of a command line, as `__call__` takes them. Raises InputError, and SystemExit for words that are no options."""
+        """Parse a command line into arguments of `__call__`. Raises InputError, and SystemExit for unknown options."""
         import tyro
 
         fields: list[Any] = []
@@ -383,21 +383,21 @@ class Stage:
 
 
 def stage(output: str, **declared: Any) -> Callable[[Callable[..., Any]], Stage]:
-    """The decorator of a stage; see `Stage` for what is declared."""
+    """Decorator that makes a function a stage; the fields of `Stage` are the declarations."""
     return lambda function: Stage(function, output, **declared)
 
 
 def _about(name: str, parameter: Parameter) -> str:
-    """Help of a command on a parameter without a note."""
+    """Help text of a parameter without a note."""
     if parameter.type is ScenarioRow:
         return "a row of the scenario table, by its name or as JSON"
     if parameter.type is Before:
-        return f"{name}.json" + (" of every camera, in their order" if parameter.many else "")
+        return f"{name}.json" + (" of every camera, in order" if parameter.many else "")
     return {Capture: "capture.json", Observations: "observations.npz"}.get(parameter.type, "")
 
 
 def read_row(text: str, settings: Config) -> ScenarioRow:
-    """A row of the scenario table, by its name or as JSON. Raises InputError."""
+    """Read a row of the scenario table, by its name or as JSON. Raises InputError."""
     from neuspring.scenes.sources import scenario_rows
 
     if text.lstrip().startswith("{"):
@@ -410,31 +410,31 @@ def read_row(text: str, settings: Config) -> ScenarioRow:
 
 
 def reset_opencv() -> None:
-    """Set OpenCV's random generator as in a new process: grabCut draws from it, and other stages may have run before this one."""
+    """Reset OpenCV's random generator to its initial state: grabCut uses it, and other stages may have run in this process."""
     if cv2 := sys.modules.get("cv2"):
         cv2.setRNGSeed(0)
 
 
 def physics(rows: Rows) -> tuple[Any, ...]:
-    """The physics, of which a launch has one, as the scenario table says it."""
+    """The physics of a scenario, which must be equal for all members of a launch."""
     return rows.scenario.self_collision, rows.scenario.ground
 
 
 def paths(records: Iterable[Before]) -> list[Path]:
-    """Files of the records."""
+    """Paths of the records."""
     return [before.path for before in records]
 
 
 def there(data: Path | None, names: Sequence[str]) -> list[Path]:
-    """The files of these names in a folder of the user's that are there; data that are one file are that file."""
+    """The existing files of these names in a user's folder; if `data` is a file, that file."""
     if data is None:
         return []
     return [data] if data.is_file() else [data / name for name in names if (data / name).exists()]
 
 
 def require_length(capture: Capture, observations: Observations) -> None:
-    """Raise InputError unless a capture and its observations have as many frames."""
+    """Raise InputError if a capture and its observations have different numbers of frames."""
     if capture.frame_count != observations.scenario.frame_count:
         rule = f"must have as many frames as the observations: {observations.scenario.frame_count}"
-        remedy = "Correct the data, or set images.enabled: false to go without pictures."
+        remedy = "Correct the data, or set images.enabled: false to skip images."
         raise InputError(capture.folder / CAPTURE, rule, capture.frame_count, remedy)

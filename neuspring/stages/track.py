@@ -1,4 +1,4 @@
-"""Masks of one camera -> tracks of pixels."""
+"""Stage `track`: masks of one camera -> tracks of pixels."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def track(capture: Capture, camera: str, masks: Before, settings: Config, run: R
     labels = Masks.load(masks.file("masks")).labels
     followed = BACKENDS["track"][section.backend].track(capture, camera, labels, settings.perception, device)
     if not (count := followed.pixels.shape[1]):
-        print(f"camera {camera}: neither object nor hands in frame 0; it is not used", flush=True)
+        print(f"camera {camera}: neither object nor hands are visible in frame 0; this camera is not used", flush=True)
     facts = {"points": float(count), "visible_share": float(followed.visible.mean()) if count else 0.0}
     tracks = PixelTracks(pixels=followed.pixels, visible=followed.visible, backend=section.backend, facts=facts)
     files = run.beside(tracks="tracks.npz", picture="tracks.png")

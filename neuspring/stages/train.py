@@ -1,4 +1,4 @@
-"""Training frames -> the model of a baseline."""
+"""Stage `train`: training frames -> the model of a baseline."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _reads(settings: Config, given: Any) -> tuple[str, ...]:
 
 
 def _stamp(rows: Rows) -> str:
-    """Optional weights, where pictures are trained on."""
+    """Available optional weights, for models that are trained on images."""
     baseline = BASELINES[rows.method.model or ""] if rows.method else None
     return baseline.features() if baseline and baseline.pictured(rows.config) else ""
 
@@ -51,22 +51,22 @@ def train(
 ) -> Written:
     """Observations -> trained model of a baseline: model.npz, history.parquet.
 
-    A checkpoint that a killed training left is continued.
+    A killed training resumes from its checkpoint. `settings` contains the method's settings in the model's section of
+    `baselines`. Training on silhouettes also requires capture, masks and splats. A training that ends early is recorded as a
+    failure with its last usable model; one that cannot start is recorded without a model.
 
-    `settings` has the method's own in the model's section of `baselines`. What is trained on silhouettes takes capture, masks and
-    splats too. A training that ends early is recorded as a failure, with its last usable model; one that cannot begin, without a
-    model. Raises InputError where silhouettes are asked for without pictures, and for models that are not trained.
+    Raises InputError for silhouettes without masks or splats, and for models without training.
     """
     from neuspring.core.checkpoint import checkpoint_key
     from neuspring.core.files import write_history
 
     trained = [name for name, baseline in BASELINES.items() if baseline.trained]
     if model not in trained:
-        raise InputError("--model", f"only {', '.join(trained)} are trained", model)
+        raise InputError("--model", f"must be a model with training: {', '.join(trained)}", model)
     pictures = None
     if capture is not None:
         if not (masks and appearance):
-            raise InputError("--capture", "silhouettes need --masks and --appearance too", capture.folder)
+            raise InputError("--capture", "requires --masks and --appearance", capture.folder)
         pictures = Pictures(capture.folder, paths(masks), appearance.file("splats"))
 
     def key(**facts: Any) -> str:

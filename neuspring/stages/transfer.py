@@ -1,4 +1,4 @@
-"""A learned model -> its scores on other recordings of the same object."""
+"""Stage `transfer`: a learned model -> its scores on other recordings of the same object."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neuspring.twin.body import body_of, code
 
 
 def _moves(rows: Rows) -> bool:
-    """True for models that other recordings can take. Oracles concern their own recording alone."""
+    """True for models that can be applied to other recordings. Oracles are limited to their own recording."""
     row = rows.method
     return bool(rows.targets and row and not row.oracle and (row.search or (row.model and BASELINES[row.model].transfers)))
 
@@ -35,19 +35,19 @@ def transfer(
     settings: Config,
     run: Recorder,
     learned: MayFail | None = None,
-    model: Annotated[str | None, "of a baseline, whose code then counts; none for twins"] = None,
+    model: Annotated[str | None, "model of a baseline; none for twins"] = None,
     seed: int = 0,
     device: str = "auto",
 ) -> Written:
     """Learned model -> scores on other recordings of the object: transfer.parquet (task `transfer`), transfer_frames.parquet.
 
-    The latter has every distance in every frame (`scenario` is the target). transfer_positions.npz has the predicted nodes
-    [F, N, 3], float32, m, by target.
+    transfer_frames.parquet contains all distances in all frames (`scenario` is the target). transfer_positions.npz contains the
+    predicted nodes [F, N, 3], float32, m, by target.
 
-    `learned` names a twin (search.json, fit.json), or a trained baseline that can be transferred (train.json); a model that learns
-    nothing goes without. All frames after the first of a target count. With `simulation.initial_velocity: observed`, frames 1 and 2
-    also set the initial velocity. A target must have the same nodes in the same order. A rollout that diverges leaves out its
-    target.
+    `learned` is the record of a twin (search.json, fit.json) or of a trained baseline that can be transferred (train.json);
+    models that learn nothing have none. A target must have the same nodes in the same order. All of its frames except frame 0
+    are scored; with `simulation.initial_velocity: observed`, frames 1 and 2 also determine the initial velocity. Targets whose
+    rollout diverges are left out.
     """
     import numpy as np
     import pandas as pd

@@ -1,7 +1,7 @@
-"""The body: what a twin is made of. The lattice of springs and the bodies of packages answer the same questions.
+"""The interface of a body, the kind of model of a twin: the lattice, or a body of another package.
 
-A body is a module of `neuspring.twin.bodies` with a `body`, or an entry point of the group `neuspring.bodies`. It imports what it
-computes with in its methods: the workflow asks for names and settings before any job exists.
+A body is the attribute `body` of a module in `neuspring.twin.bodies`, or an entry point of the group `neuspring.bodies`. A body
+imports its numerical libraries inside its methods, because the workflow reads names and settings before any job exists.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Learned:
-    """A twin that a search or a fit has found, and how."""
+    """The result of a search or a fit."""
 
     twin: Twin
     course: pd.DataFrame
@@ -34,24 +34,24 @@ class Learned:
     facts: dict[str, Any] = field(default_factory=dict)
     """Numbers and text for the record."""
     attempts: int = 1
-    """1, plus one for every time it continued from its record."""
+    """1, plus one for every time it resumed from its record."""
     earlier_seconds: float = 0.0
-    """Wall time of the attempts that this one continued, up to what was recorded last."""
+    """Wall time of the earlier attempts, up to their last record, s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
-    """The way a search runs; a body leaves alone what it has no use for."""
+    """Options of a search. A body ignores options that do not apply to it."""
 
     clusters: int = 1
-    """Regions of a topology, each with values of its own."""
+    """Number of regions of the topology, each with its own values."""
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
     together: int = 0
-    """Candidates in one launch at most; 0: as many as are fast on the device."""
+    """Maximum number of candidates per launch; 0: as many as are fast on the device."""
     record: Path | None = None
-    """File of the trace; one with the same `key` that is there already may be continued."""
+    """File of the trace. The search may resume from an existing trace with the same `key`."""
     key: str = ""
 
 
@@ -67,21 +67,21 @@ class SearchTask:
 
 @dataclass(frozen=True)
 class FitTask:
-    """A fit and where its checkpoints go."""
+    """A fit and the file of its checkpoints."""
 
     problem: Any
     """A `fit.FitProblem`."""
     partial: Path | None = None
-    """File of the checkpoints; one with the same `key` that is there already is continued."""
+    """File of the checkpoints. The fit resumes from an existing checkpoint with the same `key`."""
     key: str = ""
     threads: int = 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lines:
-    """Lines that a twin is drawn with: those of its body, then the springs of hands.
+    """Lines of a figure of a twin: first those of its body, then the controller springs.
 
-    A point is a node, then a controller, then what else the body has.
+    Points are the nodes, then the controllers, then further points of the body.
     """
 
     pairs: np.ndarray
@@ -91,122 +91,125 @@ class Lines:
     stiffness: np.ndarray
     """[L], N."""
     inner: int
-    """Number of lines that are the body's; the others are those of hands."""
+    """Number of the body's lines; the remaining lines are controller springs."""
     kind: str
     """Name of the body's lines: springs, edges."""
     about: str
-    """Their name where stiffness is shown."""
+    """Name of the body's lines in figures of stiffness."""
     labels: np.ndarray
     """Region of each point [P]."""
     masses: np.ndarray
-    """Mass of each point [P], kg; 0 where it has none."""
+    """Mass of each point [P], kg; 0 for a point without mass."""
     points: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """From nodes [N, 3] and controllers [C, 3] to all points [P, 3], m."""
+    """Function from nodes [N, 3] and controllers [C, 3] to all points [P, 3], m."""
 
     @property
     def kinds(self) -> str:
-        """Names of all lines, those of hands included."""
+        """Names of all lines, controller springs included."""
         return " and ".join(dict.fromkeys([self.kind, "springs"]))
 
     @property
     def typical(self) -> float:
-        """Median stiffness of the body's lines, N; of all where it has none."""
+        """Median stiffness of the body's lines, N; of all lines if the body has none."""
         return float(np.median(self.stiffness[: self.inner or None]))
 
 
 class Body(ABC):
-    """A kind of body. What has a default holds for bodies that are integrated implicitly: any substep is stable."""
+    """A kind of body. The defaults suit implicitly integrated bodies, for which any substep is stable."""
 
     name: str
-    """Its name in the registry."""
+    """Name in the registry."""
     fits: tuple[str, ...]
-    """Kinds of fits that it has; the first is the default."""
+    """Supported kinds of fits; the first is the default."""
     reads: tuple[str, ...] = ()
-    """Settings that its search reads beside those of every search."""
+    """Settings that its search reads in addition to those of every search."""
     by_gradients = False
-    """Fits go epoch by epoch, with gradients: they share launches, and sweeps watch them."""
+    """True if fits run epoch by epoch with gradients: they share launches, and sweeps watch them."""
     format: str
     """Name of the plain export's format."""
     about: str
-    """The body, in the plain export."""
+    """Description of the body in the plain export."""
     convention = "1 kg per node"
-    """Masses of its twins where nobody weighed the object."""
+    """Masses of twins whose object was not weighed."""
     sizes: Mapping[str, str] = {}
-    """Meaning of the dimensions of the arrays of its data (`Twin.body`), in the plain export."""
+    """Meaning of the array dimensions of its data (`Twin.body`), in the plain export."""
     equations: str
-    """A step of its simulation, in the plain export; a paragraph each."""
+    """Steps of its simulation in the plain export, one paragraph per step."""
 
     @abstractmethod
     def describes(self, twin: Twin) -> bool:
-        """True for a twin that has this body, by `Twin.body`."""
+        """Return True if the twin has this body, by `Twin.body`."""
 
     # --- from recordings to twins
 
     @abstractmethod
     def search(self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions) -> Learned:
-        """A coarse twin, on a recording and a pool of others."""
+        """Search a coarse twin, on a recording and a pool of other recordings."""
 
     @abstractmethod
     def fit(self, problem: Any, *, partial: Path | None = None, key: str = "", threads: int = 1) -> Learned:
-        """The fitted twin of a `fit.FitProblem`; checkpoints go to the file `partial`."""
+        """Fit the twin of a `fit.FitProblem`; write checkpoints to the file `partial`."""
 
     def search_many(self, tasks: Sequence[SearchTask]) -> Sequence[Learned | Exception]:
-        """The result of each search, or the exception that ended it; searches may share launches."""
-        return [_tried(self.search, one.observations, one.pool, one.settings, one.options) for one in tasks]
+        """Return the result of each search, or the exception that ended it. Searches may share launches."""
+        return [_tried(self.search, task.observations, task.pool, task.settings, task.options) for task in tasks]
 
     def fit_many(self, tasks: Sequence[FitTask], most: int = 0) -> Sequence[Learned | Exception]:
-        """The result of each fit, or the exception that ended it; at most `most` (0: as many as are fast) share launches."""
-        return [_tried(self.fit, one.problem, partial=one.partial, key=one.key, threads=one.threads) for one in tasks]
+        """Return the result of each fit, or the exception that ended it.
+
+        At most `most` fits share launches; 0: as many as are fast.
+        """
+        return [_tried(self.fit, task.problem, partial=task.partial, key=task.key, threads=task.threads) for task in tasks]
 
     @abstractmethod
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
-        """Raise InputError unless one twin can be judged on all recordings."""
+        """Raise InputError unless one twin can be simulated on all recordings."""
 
     @abstractmethod
     def on_recording(self, twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
-        """The twin in frame 0 of another recording of its object (`simulation.rest_lengths`).
+        """Return the twin in frame 0 of another recording of its object (`simulation.rest_lengths`).
 
-        Its simulation is still the twin's. Raises InputError if the recording is of another body.
+        The simulation settings stay those of the twin. Raises InputError if the recording does not match the twin.
         """
 
     # --- simulation
 
     @abstractmethod
     def solver(self, twin: Twin, device: str = "cpu") -> Any:
-        """A solver with the calls of `physics.solver.FrameSolver` that rollouts make, without gradients."""
+        """Return a solver without gradients that has the methods of `physics.solver.FrameSolver` that rollouts call."""
 
     def check(self, twin: Twin) -> None:
         """Raise Unstable if the twin's substep is beyond the stability bound."""
         return
 
     def stable(self, twin: Twin, safety: float) -> Twin:
-        """The twin with at least as many substeps as a part `safety` of the stability bound asks for."""
+        """Return the twin with at least the substeps that the fraction `safety` of the stability bound requires."""
         return twin
 
     def for_prediction(self, twin: Twin) -> Twin:
-        """The twin as predictions are made with it."""
+        """Return the twin with the substeps of a prediction."""
         return twin
 
     def load(self, twin: Twin) -> float:
-        """Stability criterion at the twin's substep, below `stability.LIMIT`."""
+        """Return the stability criterion at the twin's substep; stable below `stability.STABILITY_LIMIT`."""
         return 0.0
 
-    # --- pictures and files
+    # --- figures and files
 
     @abstractmethod
     def lines(self, twin: Twin) -> Lines:
-        """All lines of a twin."""
+        """Return all lines of a twin."""
 
     @abstractmethod
     def node_stiffness(self, twin: Twin) -> np.ndarray:
-        """Stiffness that each node shows [N], N."""
+        """Return the stiffness of each node in figures [N], N."""
 
     @abstractmethod
     def mass_at(self, twin: Twin, node: int) -> float:
-        """Mass that a force on a node moves first, kg."""
+        """Return the mass that a force on a node accelerates directly, kg."""
 
     def version(self, twin: Twin) -> int:
-        """Version of the plain export's format that can say all of a twin."""
+        """Return the version of the plain export's format that a twin requires."""
         return 1
 
 
@@ -221,13 +224,13 @@ BODIES: Registry[Body] = Registry("bodies", modules("neuspring.twin.bodies", "bo
 
 
 def code(*bodies: str) -> tuple[str, ...]:
-    """Modules of some bodies, or of all, and of loss terms of packages: for digests of what treats their twins."""
+    """Modules of the named bodies (none named: all) and of the loss terms of packages, for digests of code."""
     modules = [*map(BODIES.module_of, bodies or BODIES), *map(TERMS.module_of, TERMS)]
     return tuple(dict.fromkeys(name for name in modules if name != "neuspring.twin.losses"))
 
 
 def body_of(twin: Twin) -> Body:
-    """The body of a twin: the last registered one that describes it, so that a package's body goes before ours."""
+    """The body of a twin: the last registered body that describes it, so bodies of packages have priority."""
     return next(body for body in reversed(list(BODIES.values())) if body.describes(twin))
 
 
@@ -237,14 +240,14 @@ def lines_of(twin: Twin) -> Lines:
 
 
 def with_mass(twin: Twin, total: float) -> Twin:
-    """The twin with so much mass in all, kg, that moves as before: all that is in N or kg is multiplied by the same factor.
+    """Scale a twin to the total mass, kg, without a change of its motion: multiply all values in N or kg by one factor.
 
-    Drags are per mass, and collisions change velocities by ratios of masses.
+    Drag is per mass, and collisions depend only on ratios of masses.
     """
     masses = lines_of(twin).masses
-    own = masses[: len(twin.topology.nodes)]
-    if own.all():
-        twin = replace(twin, material=replace(twin.material, mass=own))
+    of_nodes = masses[: len(twin.topology.nodes)]
+    if of_nodes.all():
+        twin = replace(twin, material=replace(twin.material, mass=of_nodes))
     scaled: Twin = _scaled(twin, total / float(masses.sum(dtype=np.float64)))
     return scaled
 

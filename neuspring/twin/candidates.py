@@ -1,7 +1,7 @@
-"""A candidate of the search: its variables, the twin that they make, and its cost on every recording that counts.
+"""Candidates of the search: variables, the twin that follows from them, and its cost on all recordings.
 
-Variables are normalized to [0, 1] by their ranges; a piecewise topology of K regions has 2K + 10 of them, less `search.fixed`. A
-candidate is a whole twin: its springs are built, it is rolled out over the training frames (trials.py), and its cost is the mean
+Variables are normalized to [0, 1] by their ranges. A piecewise topology of K regions has 2K + 10 variables, without those in
+`search.fixed`. The search builds a twin per candidate and rolls it out over the training frames (trials.py). The cost is the mean
 training loss (losses.py).
 """
 
@@ -32,20 +32,20 @@ from neuspring.twin.trials import Outcome, Rollouts
 
 INTEGERS = ("object_neighbors", "controller_neighbors")
 REGIONAL = ("object_radius", "object_neighbors")
-"""Variables of which every region has its own."""
+"""Variables with one value per region."""
 PENALTY = 1e6
-"""Cost of a candidate that diverges or cannot be integrated; far above any loss in square meters."""
+"""Cost of a candidate that diverges or cannot be integrated; far above any loss in m^2."""
 UNSTABLE = "unstable"
-"""Beginning of the reasons of candidates that a fixed number of substeps cannot integrate."""
+"""Prefix of the reason of a candidate that a fixed number of substeps cannot integrate."""
 CMAES, OTHER_WAY = "cmaes", "hands"
-"""Stages of candidates that CMA-ES proposes, and of its first generation in the other way of hands (`search.hands`)."""
+"""Stages in the trace: candidates of CMA-ES, and its first generation with the rejected mode of controllers (`search.hands`)."""
 Map = Callable[..., Iterable[Any]]
-"""As the builtin `map`."""
+"""A function like the builtin `map`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """The training frames of a recording: hands and start velocities of its own, and the losses of its frames."""
+    """The training frames of a recording: controllers, start velocity, and losses."""
 
     observations: Observations
     hands: torch.Tensor
@@ -57,7 +57,7 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchProblem:
-    """Everything that a candidate is judged with."""
+    """All inputs of a search."""
 
     observations: Observations
     search: config.Search
@@ -67,19 +67,19 @@ class SearchProblem:
     device: str = "cpu"
     clusters: int = 1
     together: int = 0
-    """Candidates in one launch at most; 0: as many as the widest kernel has lanes on a CPU (8: more are no faster), a whole
-    generation on a GPU. Costs do not depend on it, bit for bit on a CPU."""
+    """Maximum number of candidates per launch; 0: 8 on a CPU, a generation on a GPU. On a CPU, costs do not depend on it, bit for
+    bit."""
     threads: int = 1
-    """Threads that simulate at the same time, on a CPU."""
+    """Number of threads that simulate at the same time, on a CPU."""
     pool: tuple[Observations, ...] = ()
-    """Other recordings of the object; a candidate's cost is the mean over all.
+    """Other recordings of the object; a candidate's cost is the mean over all recordings.
 
-    Its springs are made once, on the nodes of `observations` in frame 0 (or their rest shape), with that body's `spacing` and
-    `reach`, and are moved to each recording, node i on node i. Radii measured in each recording's own lengths would join other
-    nodes there, and the material of one topology would be judged on another.
+    Springs are built once, on the nodes of `observations` at rest, with the `spacing` and `reach` of these nodes. They are moved
+    to each recording, node i on node i. Radii in units of each recording would connect other nodes, so a material would be tested
+    with several topologies.
     """
     recordings: tuple[Recording, ...] = field(init=False)
-    """The scenario's own and those of the pool; a candidate has a twin on each."""
+    """The scenario's recording and those of the pool; a candidate has a twin on each."""
     labels: np.ndarray = field(init=False)
     """Region of each node [N]."""
     spacing: float = field(init=False)
@@ -108,7 +108,7 @@ class SearchProblem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All that makes a candidate: the variables of the settings, regional ones as name.0, name.1, ... (bare for one)."""
+        """Names of all variables of a candidate; regional variables are name.0, name.1, ..., or plain with a single region."""
         names = []
         for name in VARIABLES:
             regional = name in REGIONAL and self.clusters > 1
@@ -117,11 +117,11 @@ class SearchProblem:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Names of what is searched: `names` without `search.fixed`."""
+        """Names of the searched variables: `names` without `search.fixed`."""
         return tuple(name for name in self.names if name.partition(".")[0] not in self.search.fixed)
 
     def decode(self, normalized: np.ndarray) -> dict[str, float]:
-        """Physical values (lengths in m) of all `names`, from normalized `variables`; neighbor counts are truncated to integers."""
+        """Convert normalized `variables` to physical values of all `names`, lengths in m. Neighbor counts are truncated."""
         searched = dict(zip(self.variables, normalized, strict=True))
         values = {}
         for name in self.names:
@@ -134,19 +134,19 @@ class SearchProblem:
         return values
 
     def encode(self) -> np.ndarray:
-        """Normalized `variables` of the starting values."""
+        """Return the normalized `variables` of the start values."""
         settings = [getattr(self.search.variables, name.partition(".")[0]) for name in self.variables]
         return np.array([variable.normalized(variable.start) for variable in settings])
 
     def of_regions(self, values: dict[str, float], name: str) -> list[float]:
-        """A regional variable's value in each region."""
+        """Return the value of a regional variable in each region."""
         return [values[name]] if self.clusters == 1 else [values[f"{name}.{region}"] for region in range(self.clusters)]
 
 
 def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_667: bool) -> Twin:
-    """The twin with its number of substeps: 667 with the quirk, else as configured: a fixed count or the smallest safe one.
+    """Set the substeps of a twin: 667 with the quirk, otherwise the configured count, or with `auto` the smallest safe count.
 
-    Raises InputError if a fixed count is too small, NumericalFailure if `auto` would need more than `stability.MAX_SUBSTEPS`.
+    Raises InputError if a fixed count is too small, and NumericalFailure if `auto` requires more than `stability.MAX_SUBSTEPS`.
     """
     if frame_time_667 or settings.substeps != "auto":
         count = stability.RELEASED_SUBSTEPS if frame_time_667 else int(settings.substeps)
@@ -155,14 +155,14 @@ def with_substeps(twin: Twin, settings: config.SimulationSettings, frame_time_66
         return twin
     count = stability.needed_substeps(twin, settings.safety)
     if count > stability.MAX_SUBSTEPS:
-        raise NumericalFailure(f"needs {count} substeps per frame, more than {stability.MAX_SUBSTEPS}")
+        raise NumericalFailure(f"requires {count} substeps per frame, more than {stability.MAX_SUBSTEPS}")
     return stability.with_substeps(twin, count)
 
 
 def candidate(problem: SearchProblem, values: dict[str, float], push: bool = False) -> Twin:
-    """The twin of one set of physical values, whose hands hold, or only `push`.
+    """Build the twin of a set of physical values. Its controllers hold, or only `push`.
 
-    Raises InputError or NumericalFailure if it cannot be integrated.
+    Raises InputError or NumericalFailure if the twin cannot be integrated.
     """
     observations, settings, scenario = problem.observations, problem.simulation, problem.observations.scenario
     topology = piecewise_topology(
@@ -181,7 +181,7 @@ def candidate(problem: SearchProblem, values: dict[str, float], push: bool = Fal
     if count == 0:
         raise NumericalFailure("no node has a spring")
     if push:
-        # A hand that pushes acts from where it touches on, not from where it was in frame 0.
+        # A controller that pushes acts from the contact distance on, not from its distance in frame 0.
         led = np.arange(count) >= topology.object_spring_count
         lengths = np.where(led, np.minimum(topology.rest_lengths, values["contact_distance"]), topology.rest_lengths)
         topology = replace(topology, rest_lengths=lengths.astype(np.float32), pushes=led)
@@ -200,19 +200,19 @@ def candidate(problem: SearchProblem, values: dict[str, float], push: bool = Fal
 
 
 def still_cost(recordings: Sequence[Recording]) -> float:
-    """Cost of a twin that stays where it is in frame 0, m^2."""
+    """Cost of a static twin, which repeats frame 0, m^2."""
     costs = []
-    for one in recordings:
-        nodes = torch.tensor(one.observations.nodes, dtype=torch.float32, device=one.hands.device)
-        costs.append(np.mean([float(one.loss(frame, nodes)) for frame in range(1, len(one.hands))]))
+    for recording in recordings:
+        nodes = torch.tensor(recording.observations.nodes, dtype=torch.float32, device=recording.hands.device)
+        costs.append(np.mean([float(recording.loss(frame, nodes)) for frame in range(1, len(recording.hands))]))
     return float(np.mean(costs))
 
 
 def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> list[list[int]]:
-    """Candidates that are simulated together, each group and the groups slowest first; see `SearchProblem.together`.
+    """Group the candidates that are simulated together (`SearchProblem.together`), slowest first.
 
-    On a CPU lanes wait for slower ones, so alike ones are put together. Where every thread has one group they are dealt out, so
-    that all end at about the same time.
+    On a CPU, lanes wait for the slowest lane, so candidates with similar numbers of substeps form a group. If there are at least
+    as many threads as groups, candidates are dealt out in turn, so that all groups end at about the same time.
     """
     order, size = list(range(len(twins))), together or len(twins)
     if device == "cpu":
@@ -223,9 +223,9 @@ def groups(twins: Sequence[Twin], device: str, together: int, threads: int) -> l
 
 
 def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> tuple[dict[str, Any], tuple[Twin, ...]]:
-    """A candidate's row, its cost the penalty, and its twin on each recording.
+    """Build a candidate: its row of the trace, with the penalty as cost, and its twin on each recording.
 
-    None, with the reason in the row, if one cannot be integrated.
+    There are no twins if one of them cannot be integrated; the row then contains the reason.
     """
     start = time.perf_counter()
     values, settings, released = problem.decode(normalized), problem.simulation, problem.quirks.frame_time_667
@@ -237,7 +237,7 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
         twin = candidate(problem, values, push)
         row |= {"springs": len(twin.topology.springs), "substeps": twin.simulation.substeps}
         moved = (move(twin, seen, keep_frame_time=released, rest_lengths=settings.rest_lengths) for seen in problem.pool)
-        family = (twin, *(with_substeps(each, settings, released) for each in moved))
+        family = (twin, *(with_substeps(other, settings, released) for other in moved))
     except NumericalFailure as failure:
         row["reason"] = str(failure)
     except stability.Unstable as failure:
@@ -248,13 +248,14 @@ def made(problem: SearchProblem, normalized: np.ndarray, push: bool = False) -> 
 
 
 def evaluate(
-    problem: SearchProblem, population: Sequence[np.ndarray], push: bool, index: int, generation: int, each: Map = map
+    problem: SearchProblem, population: Sequence[np.ndarray], push: bool, index: int, generation: int, parallel_map: Map = map
 ) -> Generator[list[Rollouts], list[tuple[list[Outcome], float]], list[dict[str, Any]]]:
-    """Rows of the trace for the candidates of a generation, numbered from `index` on; `each` may work in several threads.
+    """Evaluate the candidates of a generation; return their rows of the trace, numbered from `index` on.
 
-    Yields the rollouts that it wants, of one group on one recording each, and is sent their outcomes and the seconds they took.
+    `parallel_map` may use several threads. The generator yields the rollouts of each group on each recording. It receives
+    their outcomes and times, s.
     """
-    candidates = list(each(lambda normalized: made(problem, normalized, push), population))
+    candidates = list(parallel_map(lambda normalized: made(problem, normalized, push), population))
     for number, (row, _) in enumerate(candidates):
         row |= {"rollout": index + number, "generation": generation}
     rows, families = [row for row, family in candidates if family], [family for _, family in candidates if family]
@@ -265,32 +266,32 @@ def evaluate(
     answers = iter(
         (
             yield [
-                Rollouts([families[k][place] for k in group], one.hands, one.velocity, one.loss)
+                Rollouts([families[k][number] for k in group], recording.hands, recording.velocity, recording.loss)
                 for group in members
-                for place, one in enumerate(recordings)
+                for number, recording in enumerate(recordings)
             ]
         )
     )
     for group in members:
         results = [next(answers) for _ in recordings]
         share = sum(seconds for _, seconds in results) / len(group)
-        for k, result in zip(group, map(mean_outcome, zip(*(own for own, _ in results), strict=True)), strict=True):
+        for k, result in zip(group, map(mean_outcome, zip(*(outcomes for outcomes, _ in results), strict=True)), strict=True):
             rows[k]["collision_overflow"] = result.collision_overflow
             rows[k]["seconds"] += share
             if result.diverged_frame:
                 rows[k]["reason"] = f"a node left the scene in frame {result.diverged_frame}"
             elif math.isnan(result.cost):
-                # CMA-ES would rank it in the middle, in silence.
-                rows[k]["reason"] = "its cost is not a number"
+                # CMA-ES would silently rank NaN in the middle.
+                rows[k]["reason"] = "the cost is not a number"
             else:
                 rows[k]["cost"] = min(result.cost, PENALTY)
     return [row for row, _ in candidates]
 
 
 def mean_outcome(results: Sequence[Outcome]) -> Outcome:
-    """One candidate on several recordings: the mean cost; it diverged if it diverged on any."""
+    """Combine the outcomes of a candidate on several recordings: the mean cost, and divergence if any rollout diverged."""
     if len(results) == 1:
         return results[0]
-    diverged = next((one.diverged_frame for one in results if one.diverged_frame), 0)
-    cost = float(np.mean([one.cost for one in results]))
-    return Outcome(cost, diverged, sum(one.collision_overflow for one in results))
+    diverged = next((outcome.diverged_frame for outcome in results if outcome.diverged_frame), 0)
+    cost = float(np.mean([outcome.cost for outcome in results]))
+    return Outcome(cost, diverged, sum(outcome.collision_overflow for outcome in results))

@@ -1,18 +1,19 @@
-"""First-order stage: springs, or a neural spring field, by Adam with gradients through the simulation.
+"""The fit: Adam with gradients through the simulation, for free springs or a neural spring field.
 
-An epoch is one pass over the training frames of each recording from rest. Every `horizon` frames (1 as released, 0 for the
-whole training span) one optimizer step is made with the gradient through those frames, as far back as `solver.AdjointLimit`
-lets it; the state is detached there and goes on while parameters change, so no twin has the mean loss of an epoch. Every
-ROLLOUT_EVERY epochs a rollout of the parameters from rest gives the loss of a twin. The result is the start, or the last twin
-whose loss is lower by a fraction `plateau` than that of the result before: no fit ends behind its search. Rollouts count the
-frames that are trained on, or a held-back tail of the training frames. A fit ends when they have stopped falling. Test frames
-are never read, but by an oracle (`FitProblem.oracle`). A non-finite loss or gradient restores the parameters of the epoch's
-start, halves the learning rates and is reported.
+An epoch is one pass over the training frames of each recording, from frame 0. Every `horizon` frames (released: 1; 0: all
+training frames), one optimizer step uses the gradient through these frames, unless `solver.AdjointLimit` shortens it. The state
+is then detached and continues with the new parameters. Therefore no twin has the mean loss of an epoch, and every ROLLOUT_EVERY
+epochs a rollout from frame 0 measures the loss of a twin.
 
-What is differentiated is the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length; what
-is recorded is in m^2.
+The result starts as the search's twin. A later twin replaces it if its rollout loss is lower by the fraction `plateau`, so no fit
+is worse than its search. Rollouts count the frames that are trained on, or a held-back tail of the training frames. A fit ends
+when the rollout loss no longer falls. Only an oracle (`FitProblem.oracle`) reads future frames. A non-finite loss or gradient
+restores the parameters of the epoch's start, halves the learning rates and is reported.
 
-A fit is a generator that yields the frames and gradients it needs (batch.py), so several fits can share launches.
+Gradients are of the loss in squared node spacings (`loss_unit`), so a fit does not depend on the unit of length. Records are in
+m^2.
+
+A fit is a generator that yields requests for frames and gradients (batch.py), so several fits can share launches.
 """
 
 from __future__ import annotations
@@ -50,32 +51,32 @@ if TYPE_CHECKING:
 BETAS = (0.9, 0.99)
 """Adam's decay rates of the first and the second moment, as released."""
 ADJOINT_LIMIT = 100.0
-"""Growth of the adjoint of the state, as a multiple of what losses have added to it, at which the gradient through several frames
-ends (`solver.AdjointLimit`)."""
+"""Largest adjoint of the state, as a multiple of what the losses add to it, beyond which a gradient stops
+(`solver.AdjointLimit`)."""
 TAIL_FRACTION = 0.2
-"""Part of the training frames on which nothing is fitted with `fit.selection: tail`, as in sweeps."""
+"""Fraction of the training frames that `fit.selection: tail` holds back, as in sweeps."""
 ROLLOUT_EVERY = 5
-"""Epochs between two rollouts. All fits that share launches make theirs together."""
+"""Epochs between two rollouts. Fits that share launches roll out in the same epochs."""
 PLATEAU_EPOCHS = 40
 """Epochs without a better twin after which a fit has converged."""
 MOST_GROWTH = 3.0
-"""Substeps that dashpots alone and stiffness alone may ask for, as a multiple of the search's; both together ask for fewer than five
-times as many. A few springs that stiffen without end would set the cost of all."""
+"""Largest growth of the substeps due to dashpots alone, and due to stiffness alone; both together cause less than fivefold
+growth. Without a limit, a few stiff springs would determine the cost of all."""
 MAX_ROLLBACKS = 5
 RELEASED_CHECKPOINT_EPOCHS = 20
 
 
 _Motion = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]
-"""x [N, 3] m, v [N, 3] m/s, and rest lengths of grips that have begun (controllers.py)."""
+"""x [N, 3] m, v [N, 3] m/s, and rest lengths of grasps that began after frame 0 (controllers.py)."""
 
 
 class NonFinite(ArithmeticError):
-    """A loss or gradient is not finite; says where."""
+    """A loss or gradient is not finite. The text names the frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitProblem:
-    """Everything that a fit is made from."""
+    """All inputs of a fit."""
 
     observations: Observations
     twin: Twin
@@ -87,51 +88,55 @@ class FitProblem:
     kind: str = "springs"
     """One of the body's `fits`."""
     seed: int = 0
-    """Seed of the field's first weights."""
+    """Seed of the field's initial weights."""
     oracle: bool = False
-    """Fit all frames, the future included: no prediction, but what fitting could reach at best."""
+    """Fit all frames, future frames included: not a prediction, but the limit of fitting."""
     pool: Sequence[Observations] = ()
-    """Other recordings of the object, that one material is fitted on together with `observations`."""
+    """Other recordings of the object. The fit trains one material on these and `observations`."""
 
     def __post_init__(self) -> None:
         body = body_of(self.twin)
         body.require_pool(self.observations, self.pool)
         if self.kind not in body.fits:
-            raise InputError("fit, kind", f"a {body.name} is fitted as {' or '.join(body.fits)}", self.kind)
+            raise InputError("fit, kind", f"a {body.name} has the fits {' and '.join(body.fits)}", self.kind, "Choose one.")
         if self.oracle and self.fit.selection == "tail":
-            raise InputError("fit.selection", "an oracle is fitted on all frames and holds none back", "tail", "Use rollout.")
+            raise InputError("fit.selection", "an oracle fits all frames, so it cannot hold back a tail", "tail", "Use rollout.")
 
     @property
     def frame_end(self) -> int:
-        """Frames that the fit reads, from frame 0 on: those before the split; all of them for an oracle."""
+        """Number of frames that the fit reads, from frame 0 on: the training frames; all frames for an oracle."""
         return frames_seen(self.observations, oracle=self.oracle)
 
     @property
     def frames(self) -> int:
-        """Frames that an epoch passes over, on all recordings."""
-        return sum(frames_seen(one, oracle=self.oracle) - 1 for one in (self.observations, *self.pool))
+        """Number of frames that an epoch passes over, on all recordings."""
+        return sum(frames_seen(seen, oracle=self.oracle) - 1 for seen in (self.observations, *self.pool))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitResult(Learned):
     """The best twin, and the history: one row per epoch (epoch, loss, rollout_loss, gradient_norm, rolled_back, learning_rate).
 
-    Gradients are those of the loss in its unit (`fit.loss_unit`). Facts: best_epoch, whose end is the result (-1: the start);
-    rollout_loss, m^2, of the result, running_loss, the mean of its epoch, and search_loss, of the start's rollout; converged;
-    rollbacks; what moved and what was in the way (`movement`).
+    Gradients are of the loss in its unit (`fit.loss_unit`). Facts:
+
+    - best_epoch: the epoch whose end is the result; -1: the search's twin
+    - rollout_loss, m^2: of the result
+    - running_loss, m^2: mean loss during the best epoch
+    - search_loss, m^2: rollout of the search's twin
+    - converged, rollbacks, and the shares of `movement`
     """
 
     history: pd.DataFrame
 
     @property
     def rollout_loss(self) -> float:
-        """Mean loss of the result's rollout, m^2, over the frames that are trained on, or the held-back tail."""
+        """Mean loss of the result's rollout, m^2, over the frames that are trained on or the held-back tail."""
         return float(self.facts["rollout_loss"])
 
 
 @dataclass
 class _State:
-    """Everything that a continued fit needs besides its history."""
+    """All that a fit needs to resume, besides its history."""
 
     values: dict[str, np.ndarray]
     moments: dict[str, np.ndarray]
@@ -146,7 +151,7 @@ class _State:
     overflow: int = 0
 
     def converged(self, epochs: int, plateau: float) -> bool:
-        """True where the last PLATEAU_EPOCHS of so many epochs have brought no better twin."""
+        """True if the last PLATEAU_EPOCHS of `epochs` epochs found no better twin."""
         return plateau > 0 and epochs > self.best_epoch + PLATEAU_EPOCHS
 
     def checkpoint(self) -> Checkpoint:
@@ -160,28 +165,28 @@ class _State:
 
 
 FIT_ARRAYS = ("values", "moments", "best_values")
-"""The fields of a state that hold arrays."""
+"""Fields of a state that contain arrays."""
 
 
 def tail_start(train_end: int) -> int:
-    """The first held-back frame of `train_end` training frames: at least one frame is trained on, and one selects the epoch."""
+    """First held-back frame of `train_end` training frames. At least one frame is trained on, and at least one is held back."""
     return train_end - min(max(round(TAIL_FRACTION * (train_end - 1)), 1), train_end - 2)
 
 
 class FitRecording:
-    """A recording that a fit passes over: its twin, hands, start and losses."""
+    """A recording of a fit: its twin, controllers, start and losses."""
 
     def __init__(self, problem: FitProblem, observations: Observations, twin: Twin) -> None:
-        """`twin` is the problem's, in frame 0 of the recording."""
+        """`twin`: the problem's twin, in frame 0 of the recording."""
         settings, device = problem.fit, problem.device
         end = frames_seen(observations, oracle=problem.oracle)
         if settings.selection == "tail" and end < 3:
-            raise InputError("fit.selection", "a held-back tail needs at least two training frames after frame 0", end - 1)
+            raise InputError("fit.selection", "tail requires at least two training frames after frame 0", end - 1, "Use rollout.")
         self.fitted_end = tail_start(end) if settings.selection == "tail" else end
         self.horizon = settings.horizon or self.fitted_end - 1
         self.source = SimulatedTwin(twin, device, self.horizon)
         self.start = start_values(twin, device)
-        """Physical values of the twin before the fit, with the distances of this recording."""
+        """Physical values of the twin before the fit, with the rest lengths of this recording."""
         self.loss = FrameLoss.of(
             *(observations, problem.losses, device), frozen_counts=problem.quirks.frozen_loss_denominators, oracle=problem.oracle
         )
@@ -195,16 +200,16 @@ class FitRecording:
         may_grow = problem.simulation.substeps == "auto" and not problem.quirks.frame_time_667
         self.most_substeps = stability.MAX_SUBSTEPS if may_grow else 0
         self._known: tuple[stability.Spectrum, np.ndarray, np.ndarray] | None = None
-        """The last spectrum that was computed, and for which stiffness and dashpots."""
+        """The last computed spectrum, and its stiffness and dashpots."""
 
     @property
     def twin(self) -> Twin:
-        """The twin, with the present number of substeps."""
+        """The twin, with the current number of substeps."""
         return self.source.twin
 
     @property
     def judged(self) -> range:
-        """The frames by which twins are chosen: the held-back tail, or without one those that are trained on."""
+        """The frames that select the twin: the held-back tail, or without a tail those that are trained on."""
         return range(self.fitted_end if self.fitted_end < len(self.hands) else 1, len(self.hands))
 
     def use_substeps(self, count: int) -> None:
@@ -213,10 +218,10 @@ class FitRecording:
             self.source.replace(stability.with_substeps(self.twin, count))
 
     def stable(self, parameters: TwinParameters) -> Parameters:
-        """The present parameters, packed, after checking that they can be integrated.
+        """Pack the current parameters and ensure that they can be integrated.
 
-        Takes more substeps where they may grow. Raises NonFinite where they may not (a fixed count, the released 667,
-        `MAX_SUBSTEPS`) and the bound is passed.
+        Raises the number of substeps if necessary. Raises NonFinite if the stability bound is exceeded and the number may not
+        grow (a fixed count, the released 667, `MAX_SUBSTEPS`).
         """
         packed = parameters.pack(self.twin.simulation.substep, self.start)
         springs = packed["springs"].detach().double().cpu().numpy()
@@ -231,7 +236,7 @@ class FitRecording:
     def _needed_substeps(self, stiffness: np.ndarray, dashpot: np.ndarray) -> int:
         """Substeps per frame for stiffness Y / l0 [S] and dashpots [S]. Raises NonFinite."""
         simulation = self.twin.simulation
-        # Half of the safety margin is kept for the parameters' way to the next look.
+        # The parameters use the other half of the safety margin until the next check.
         enough = stability.STABILITY_LIMIT * (1 + self.safety) / 2
         if self._known is not None:
             # K and C grow at most as much as their fastest growing spring (sums of positive semidefinite terms).
@@ -255,7 +260,7 @@ class FitRecording:
     def frame(
         self, state: _Motion, frame: int, packed: Parameters, limit: AdjointLimit | None = None
     ) -> Generator[Any, Any, _Motion]:
-        """State at the end of a frame."""
+        """Simulate a frame; return the state at its end."""
         x, v, lengths = state
         begin, end = self.hands[frame - 1], self.hands[frame]
         lengths = self.grips.taken(lengths, x, begin)
@@ -267,7 +272,7 @@ class FitRecording:
     def simulate(
         self, state: _Motion, window: range, packed: Parameters, limit: AdjointLimit | None = None
     ) -> Generator[Any, Any, tuple[_Motion, torch.Tensor]]:
-        """State after the frames of `window`, and their mean loss."""
+        """Simulate the frames of `window`; return the state at their end and their mean loss, m^2."""
         losses = []
         for frame in window:
             state = yield from self.frame(state, frame, packed, limit)
@@ -280,22 +285,23 @@ def _tensor(values: np.ndarray, device: str) -> torch.Tensor:
 
 
 class TwinFit:
-    """Runs epochs over one recording of an object or several: one material and one state of Adam.
+    """Runs epochs over one or several recordings of an object, with one material and one state of Adam.
 
-    Stiffness, dashpots, drag and contact are shared; each recording has its own hands, start, frames, and distances at rest. The
-    recordings take turns. Losses are means over the recordings, in one unit.
+    Recordings share stiffness, dashpots, drag and contact. Each has its own controllers, start, frames and rest lengths. The
+    recordings take turns. Losses are means over the recordings.
     """
 
     def __init__(self, problem: FitProblem) -> None:
         self.problem, settings = problem, problem.fit
         self.parameters = TwinParameters(problem.twin, settings, problem.kind, problem.device, problem.seed)
         released, lengths = problem.quirks.frame_time_667, problem.simulation.rest_lengths
-        others = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
-        self.recordings = [FitRecording(problem, *one) for one in [(problem.observations, problem.twin), *others]]
+        moved = [(seen, move(problem.twin, seen, keep_frame_time=released, rest_lengths=lengths)) for seen in problem.pool]
+        self.recordings = [FitRecording(problem, *pair) for pair in [(problem.observations, problem.twin), *moved]]
         if self.recordings[0].most_substeps:
-            spectrum, substep = stability.twin_spectrum(problem.twin), problem.twin.simulation.substep
+            spectrum = stability.twin_spectrum(problem.twin)
+            dampers = 2 * spectrum.damping / (problem.twin.simulation.substep * spectrum.stiffness)
+            self.parameters.stiffness_growth = MOST_GROWTH**2 * (1 + dampers)
             self.parameters.dashpot_growth = MOST_GROWTH
-            self.parameters.stiffness_growth = MOST_GROWTH**2 * spectrum.load(substep) / (substep**2 * spectrum.stiffness)
         self.trained = list(self.parameters.parameters())
         self.optimizer = torch.optim.Adam(self.parameters.groups(), betas=BETAS, eps=settings.epsilon)
         self.loss_scale = 1.0 if settings.loss_unit == "meter" else topology_spacing(problem.twin.topology) ** -2
@@ -303,39 +309,39 @@ class TwinFit:
 
     @property
     def twin(self) -> Twin:
-        """The twin on the problem's own recording, with the present number of substeps."""
+        """The twin on the problem's own recording, with the current number of substeps."""
         return self.recordings[0].twin
 
     @property
     def collision_overflow(self) -> int:
-        """Collision candidates that did not fit the list, summed over all solvers so far."""
-        return sum(one.source.collision_overflow for one in self.recordings)
+        """Collision candidates that exceeded the list, summed over all solvers so far."""
+        return sum(recording.source.collision_overflow for recording in self.recordings)
 
     def use_substeps(self, count: int) -> None:
         """Integrate all recordings with `count` substeps per frame from now on."""
-        for one in self.recordings:
-            one.use_substeps(count)
+        for recording in self.recordings:
+            recording.use_substeps(count)
 
     def require_stable(self) -> None:
-        """Take as many substeps as the recording that needs most. Raises NonFinite."""
-        for one in self.recordings:
-            one.stable(self.parameters)
-        self.use_substeps(max(one.twin.simulation.substeps for one in self.recordings))
+        """Use as many substeps as the most demanding recording requires. Raises NonFinite."""
+        for recording in self.recordings:
+            recording.stable(self.parameters)
+        self.use_substeps(max(recording.twin.simulation.substeps for recording in self.recordings))
 
     def set_rate(self, rate: float) -> None:
-        """Set the learning rates: the settings' times `rate` (halved by rollbacks, and decaying)."""
+        """Set the learning rates to those of the settings times `rate`, which rollbacks halve and decay reduces."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group["base_rate"]
 
     def epoch(self) -> Generator[Any, Any, dict[str, float]]:
-        """One pass over the frames that are trained on, each recording in turn. Raises NonFinite.
+        """Pass once over the frames that are trained on, each recording in turn. Raises NonFinite.
 
-        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest of any step; and
-        `frames_left_out` of gradients.
+        Returns `loss`, the mean frame loss while parameters change, m^2; `gradient_norm`, the largest norm of a step; and
+        `frames_left_out`, the number of frames that `solver.AdjointLimit` omits.
         """
         rows = []
-        for one in self.recordings:
-            rows.append((yield from self._pass(one)))
+        for recording in self.recordings:
+            rows.append((yield from self._pass(recording)))
         return {
             "loss": sum(row["loss"] for row in rows) / len(rows),
             "gradient_norm": max(row["gradient_norm"] for row in rows),
@@ -348,7 +354,7 @@ class TwinFit:
         for start in range(1, end, horizon):
             window = range(start, min(start + horizon, end))
             packed = recording.stable(self.parameters)
-            # None where a window is one frame, as released.
+            # A window of one frame has no limit, as released.
             limit = AdjointLimit(ADJOINT_LIMIT, recording.twin.simulation.frame_time) if horizon > 1 else None
             state, mean = yield from recording.simulate(state, window, packed, limit)
             if not bool(torch.isfinite(mean)):
@@ -364,14 +370,14 @@ class TwinFit:
         return {"loss": total / (end - 1), "gradient_norm": largest, "frames_left_out": left_out}
 
     def rollout_loss(self) -> Generator[Any, Any, float]:
-        """Mean loss of the judged frames of all recordings, m^2, in rollouts of the present values. Raises NonFinite."""
+        """Mean loss of the `judged` frames of all recordings, m^2, in rollouts of the current values. Raises NonFinite."""
         losses = []
-        for one in self.recordings:
-            packed = {name: value.detach() for name, value in one.stable(self.parameters).items()}
-            state = one.rest
-            for frame in range(1, one.judged.start):
-                state = yield from one.frame(state, frame, packed)
-            _, mean = yield from one.simulate(state, one.judged, packed)
+        for recording in self.recordings:
+            packed = {name: value.detach() for name, value in recording.stable(self.parameters).items()}
+            state = recording.rest
+            for frame in range(1, recording.judged.start):
+                state = yield from recording.frame(state, frame, packed)
+            _, mean = yield from recording.simulate(state, recording.judged, packed)
             losses.append(float(mean.detach()))
             if not math.isfinite(losses[-1]):
                 raise NonFinite("the loss of a rollout is not finite")
@@ -393,23 +399,24 @@ class TwinFit:
 
 
 OnEpoch = Callable[[Sequence[Mapping[str, Any]]], None]
-"""Called with the history so far after every epoch and before its checkpoint; what it raises ends the fit."""
+"""Function of the history so far, called after every epoch and before its checkpoint. An exception ends the fit."""
 
 
 def fit(problem: FitProblem, *, partial: Path | None = None, key: str = "", on_epoch: OnEpoch = lambda history: None) -> FitResult:
-    """Fit a twin. `partial` is where checkpoints go; one with the same `key` is continued from.
+    """Fit a twin.
 
-    Raises NumericalFailure if no epoch could be completed, and what `on_epoch` raises.
+    `partial` is the file of checkpoints; the fit resumes from a checkpoint with the same `key`. Raises NumericalFailure if no
+    epoch could be completed, and the exceptions of `on_epoch`.
     """
     result: FitResult = result_of(lockstep([_course(FitTask(problem, partial, key), on_epoch)], SharedFrames().serve))
     return result
 
 
 def fit_many(tasks: Sequence[FitTask], most: int = 0) -> list[FitResult | Exception]:
-    """Fit several twins; the result of each task, or the exception that ended it.
+    """Fit several twins; return the result of each task, or the exception that ended it.
 
-    At most `most` fits share launches (0: as many as a CPU has lanes, or all on a GPU). Those of equal physics and horizon are in
-    step; on a CPU they must also have as many frames and the same pool, so that none waits for another.
+    At most `most` fits share launches (0: `LANE_WIDTH` on a CPU, all on a GPU). Fits that share launches have the same physics
+    and horizon. On a CPU they also have the same number of frames and the same pool, so that no fit waits for another.
     """
     alike: dict[tuple[Any, ...], list[int]] = {}
     for number, task in enumerate(tasks):
@@ -437,7 +444,7 @@ def start_loss(problem: FitProblem) -> float:
 
 
 def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: float = 1.0) -> Generator[Any, Any, FitResult]:
-    """A fit that yields its frames and gradients. `share` is the part of the time that counts for it."""
+    """A fit as a generator of requests for frames and gradients. `share` is the fraction of the time that counts for this fit."""
     import pandas as pd
 
     problem = task.problem
@@ -468,7 +475,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
     frames, counts = problem.frames, best.counts
     facts = {
         "best_epoch": state.best_epoch,
-        # A record has no infinite numbers.
+        # Records cannot contain infinite numbers.
         "search_loss": state.search_loss if math.isfinite(state.search_loss) else None,
         "running_loss": loop.history[state.best_epoch]["loss"] if state.best_epoch >= 0 else None,
         "rollout_loss": loss if math.isfinite(loss) else None,
@@ -483,7 +490,7 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
         **counts,
     }
     course = history.set_index("epoch")[["loss", "rollout_loss", "gradient_norm", "learning_rate"]]
-    # The rollout of the search's twin, before epoch 0.
+    # Row -1 is the rollout of the search's twin, before epoch 0.
     course.loc[-1, "rollout_loss"] = facts["search_loss"]
     return FitResult(
         twin=best,
@@ -498,29 +505,28 @@ def _course(task: FitTask, on_epoch: OnEpoch = lambda history: None, share: floa
 def _start(run: TwinFit, problem: FitProblem) -> Generator[Any, Any, _State]:
     """The state before the first epoch."""
     values, substeps = run.parameters.copy(), problem.twin.simulation.substeps
-    # A start that cannot be simulated does not win; if no epoch can be completed either, `fit` says so.
+    # An infinite loss cannot win. If no epoch can be completed either, `fit` raises.
     loss = yield from _rollout_or_infinite(run)
     best = math.inf if problem.fit.selection == "training_loss" else loss
     return _State(values, {}, 1.0, [], loss, -1, best, values, substeps, substeps)
 
 
 def _rollout_or_infinite(run: TwinFit) -> Generator[Any, Any, float]:
-    """The loss of a rollout, m^2; infinite where it is not finite."""
+    """The loss of a rollout, m^2; infinite if it is not finite."""
     with contextlib.suppress(NonFinite):
         return (yield from run.rollout_loss())
     return math.inf
 
 
 def _growth(values: np.ndarray, reference: np.ndarray) -> float:
-    """The largest ratio of `values` to `reference` [S], both >= 0; infinite where something grew from nothing."""
-    ratio = np.divide(values, reference, out=np.where(values > 0, np.inf, 0.0), where=reference > 0)
-    return float(ratio.max(initial=0.0))
+    """The largest ratio of `values` to `reference` [S], both >= 0; infinite if a value grew from 0."""
+    return float((values / np.maximum(reference, 1e-300)).max(initial=0.0))
 
 
 def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Generator[Any, Any, dict[str, Any]]:
-    """Run one epoch, or roll it back, and update `state`; returns the epoch's row of the history.
+    """Run one epoch, or roll it back, and update `state`; return the epoch's row of the history.
 
-    Accepted values can always be integrated with `state.substeps`.
+    Accepted values can be integrated with `state.substeps`.
     """
     row: dict[str, Any] = {"epoch": epoch, "rolled_back": False, "loss": None, "rollout_loss": None, "gradient_norm": None}
     row["frames_left_out"] = 0
@@ -536,7 +542,7 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
         state.substeps = run.twin.simulation.substeps
         row |= losses
         loss = losses["loss"] if released else losses.get("rollout_loss", math.inf)
-        # Losses of rollouts scatter: a later twin must be better by more than that.
+        # Rollout losses scatter, so a later twin must be better by more than the scatter.
         least = 0.0 if released else problem.fit.plateau
         if eligible(epoch, problem) and loss < (1 - least) * state.best_loss:
             state.best_loss, state.best_epoch = loss, epoch
@@ -552,6 +558,6 @@ def _advance(run: TwinFit, state: _State, problem: FitProblem, epoch: int) -> Ge
 
 
 def eligible(epoch: int, problem: FitProblem) -> bool:
-    """True for an epoch that may become the best: all of them, or with the released quirk every 20th and the last."""
+    """True if the epoch may become the best: any epoch, or with the released quirk every 20th and the last."""
     sparse = problem.quirks.sparse_checkpoints and epoch % RELEASED_CHECKPOINT_EPOCHS
     return not sparse or epoch == problem.fit.epochs - 1

@@ -1,20 +1,20 @@
-"""Parameters that a first-order stage trains, and the physical quantities that follow from it.
+"""Parameters that a fit trains, and the physical quantities that follow from them.
 
-Every spring has an offset o on a log scale: its own number (`springs`), or the neural spring field at its midpoint (`field`).
-With b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
+Every spring has an offset o on a log scale: its own value (`springs`), or the neural spring field at its midpoint (`field`). With
+b(o) = bound tanh(o / bound), or o without a bound, its stiffness is
 
-    Y = Y0 exp(b(o)), clamped to the stiffness range, and to g times its value in the search.
+    Y = Y0 exp(b(o)), clamped to the stiffness range and to g times Y0, the search's stiffness.
 
-Dashpots are clamped as well. Both bounds limit the substeps that a twin needs: its matrices of stiffness and damping grow at most
-as their fastest growing spring.
+Dashpots are clamped as well. Both clamps limit the substeps of a twin, because the stiffness and damping matrices grow at most as
+much as their fastest growing spring.
 
-Beside them: four contact scalars, and common factors exp(.) of stiffness (`global_stiffness`), drag and
-dashpots (`damping`). With `controller_factors` the springs of controllers, which are of another material, have their own.
+A fit also trains four contact scalars and common factors exp(.) of stiffness (`global_stiffness`), drag and dashpots (`damping`).
+With `controller_factors`, controller springs have their own factors, because they model another material.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -30,17 +30,17 @@ from neuspring.twin.field import TEXEL_SCALE, SpringField, midpoints
 
 CONTACT_SCALARS = tuple(CONTACT_LIMITS)
 DAMPING_FACTORS = ("drag", "dashpot")
-"""Fields of the material with a common factor where damping is trained. One that is zero cannot be scaled and has none."""
+"""Fields of the material with a common factor if damping is trained. A field that is zero cannot be scaled and has no factor."""
 SPRING_FACTORS = ("stiffness", "dashpot")
-"""Those that may have a factor of their own for controllers' springs."""
+"""Fields that may have a separate factor for controller springs."""
 UNTRAINED = ("contact_distance",)
-"""It only selects pairs, so it has no gradient."""
+"""Fields without a gradient: the contact distance only selects pairs."""
 LOWEST_STIFFNESS = 1e-3
-"""Stiffness below this is raised to it before taking the logarithm, N."""
+"""Smallest stiffness at the start, N; lower values are raised to it."""
 
 
 class _InwardClamp(torch.autograd.Function):
-    """Clamp whose gradient passes inside the limits, and at or beyond them if a descent step would lead back inside."""
+    """Clamp whose gradient passes inside the limits, and at or beyond a limit only if a descent step leads back inside."""
 
     @staticmethod
     def forward(ctx: Any, value: torch.Tensor, low: float, high: float | torch.Tensor) -> torch.Tensor:  # type: ignore[override]
@@ -55,32 +55,30 @@ class _InwardClamp(torch.autograd.Function):
         return gradient.masked_fill(outward, 0.0), None, None
 
 
-def inward_clamp(value: torch.Tensor, low: float, high: float | torch.Tensor) -> torch.Tensor:
-    """`value` clamped to [low, high]; a value beyond a limit still feels gradients that pull it back."""
-    result: torch.Tensor = _InwardClamp.apply(value, low, high)  # type: ignore[no-untyped-call]
-    return result
+inward_clamp: Callable[..., torch.Tensor] = _InwardClamp.apply
+"""Clamp a value to [low, high]; beyond a limit, gradients that lead back inside still pass."""
 
 
 def bounded(offset: torch.Tensor, bound: float) -> torch.Tensor:
-    """bound tanh(offset / bound); the offset itself if the bound is 0."""
+    """Return bound tanh(offset / bound), or the offset itself if the bound is 0."""
     return bound * torch.tanh(offset / bound) if bound else offset
 
 
 def topology_spacing(topology: Topology) -> float:
-    """Distance between neighboring nodes in the rest shape, m (topology.py); of one node alone, the median rest length."""
+    """Distance between neighboring nodes at rest, m (topology.py); for a single node, the median rest length."""
     nodes = topology.canonical[: len(topology.nodes)]
     return node_spacing(nodes) if len(nodes) > 1 else float(np.median(topology.rest_lengths.astype(np.float64)))
 
 
 def start_values(twin: Twin, device: str) -> dict[str, torch.Tensor]:
-    """Physical values of a twin before the fit, by the keyword names of `physics.parameters.pack`."""
+    """Physical values of a twin before the fit, with the keyword names of `physics.parameters.pack`."""
     start = twin_tensors(twin, device)
     start["stiffness"] = start["stiffness"].clamp_min(LOWEST_STIFFNESS)
     return start
 
 
 class TwinParameters(nn.Module):
-    """The trained tensors of a twin, as a module: `named_parameters` is the checkpoint's content."""
+    """The trained tensors of a twin, as a module. Checkpoints contain `named_parameters`."""
 
     def __init__(self, twin: Twin, settings: config.Fit, kind: str, device: str, seed: int = 0) -> None:
         super().__init__()
@@ -98,17 +96,17 @@ class TwinParameters(nn.Module):
         self.first = self.copy()
         """The trained values before the first step."""
         self.stiffness_growth, self.dashpot_growth = 1e6, 1e3
-        """Largest factors over the start; no fit reaches these."""
+        """Largest factors relative to the start. A fit that may change its substeps lowers them."""
 
     def _factor_names(self) -> list[str]:
-        """Common factors that are trained: what they scale, `controller_` before it where of those springs."""
+        """Names of the trained common factors: the scaled field, with the prefix `controller_` for controller springs."""
         s = self.settings
         names = ["stiffness"] if s.global_stiffness else []
         names += [name for name in DAMPING_FACTORS if s.damping != "fixed" and bool((self.start[name] > 0).any())]
         return names + [f"controller_{name}" for name in names if s.controller_factors and name in SPRING_FACTORS]
 
     def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups for the optimizer, each with its learning rate (`base_rate` is not changed later)."""
+        """Parameter groups of the optimizer, each with its learning rate. `base_rate` stays constant."""
         s = self.settings
         rate = s.learning_rate
         groups: list[tuple[Iterable[nn.Parameter], float]] = []
@@ -121,15 +119,15 @@ class TwinParameters(nn.Module):
         groups.append((self.scalars.values(), rate))
         if self.factors:
             groups.append((self.factors.values(), s.factor_learning_rate or rate))
-        return [{"params": list(each), "lr": rate, "base_rate": rate} for each, rate in groups]
+        return [{"params": list(tensors), "lr": rate, "base_rate": rate} for tensors, rate in groups]
 
     def deviation(self) -> torch.Tensor:
-        """Factor of each spring's stiffness [S], apart from common factors."""
+        """Factor of each spring's stiffness [S], without common factors."""
         offsets = self.offsets if self.offsets is not None else self.field()  # type: ignore[misc]
         return bounded(offsets[:, 0], self.settings.output_bound).exp()
 
     def _common(self, name: str) -> torch.Tensor | float:
-        """The common factor of a physical value: one number, or a number per spring."""
+        """The common factor of a physical value: a number, or a number per spring."""
         if name not in self.factors:
             return 1.0
         factor: torch.Tensor = self.factors[name].exp()
@@ -138,11 +136,11 @@ class TwinParameters(nn.Module):
         return factor
 
     def physical(self, start: Mapping[str, torch.Tensor] | None = None) -> dict[str, torch.Tensor]:
-        """Every physical parameter, with the keyword names of `physics.parameters.pack`, from `start` (none: the twin's)."""
+        """All physical parameters, with the keyword names of `physics.parameters.pack`, from `start` (None: the twin's values)."""
         s, start = self.settings, self.start if start is None else start
         values = dict(start)
         stiffness = start["stiffness"] * (self.deviation() * self._common("stiffness"))
-        # The released baseline clamps plainly. Springs of a field move together, so one beyond a limit must be able to return.
+        # Free springs are clamped as in the released code. Springs of a field move together, so they must be able to return.
         clamp = inward_clamp if self.kind == "field" else torch.clamp
         values["stiffness"] = clamp(inward_clamp(stiffness, 0.0, self.stiffness_growth * start["stiffness"]), *s.stiffness_range)
         for name in DAMPING_FACTORS:
@@ -152,11 +150,11 @@ class TwinParameters(nn.Module):
         return values | dict(self.scalars.items())
 
     def pack(self, substep: float, start: Mapping[str, torch.Tensor] | None = None) -> Parameters:
-        """Packed for the solver, differentiably."""
+        """Pack the physical parameters for the solver, differentiably."""
         return pack(**self.physical(start), substep=substep)
 
     def copy(self) -> dict[str, np.ndarray]:
-        """The trained values as arrays."""
+        """Copy the trained values to arrays."""
         return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.named_parameters()}
 
     def restore(self, values: dict[str, np.ndarray]) -> None:
@@ -166,7 +164,7 @@ class TwinParameters(nn.Module):
                 tensor.copy_(torch.from_numpy(np.asarray(values[name])))
 
     def as_twin(self, twin: Twin) -> Twin:
-        """`twin` with the current values, clamped as in the simulation."""
+        """Return `twin` with the current values, clamped as in the simulation."""
         with torch.no_grad():
             values = {name: tensor.double().cpu().numpy() for name, tensor in self.physical().items()}
         material: dict[str, Any] = {}
@@ -177,17 +175,18 @@ class TwinParameters(nn.Module):
 
 
 MOVED_TEXEL = 0.1
-"""A texel has moved if it changed by more than this fraction of the texels' scale at the start."""
+"""Fraction of the initial scale of texels by which a texel must change to count as moved."""
 NEAR_BOUND = 0.95
-"""A spring is at its bound beyond this fraction of it."""
+"""Fraction of the bound beyond which a spring counts as at its bound."""
 
 
 def movement(parameters: TwinParameters) -> dict[str, Any]:
-    """Figures of the present values against those before the first step; those that do not apply are left out.
+    """Compare the current values with those before the first step. Inapplicable entries are omitted.
 
-    texels_moved: share of texels that moved by more than a tenth of their scale at the start. at_bound: share of springs whose
-    stiffness lies within 5 % of the bound of its deviation (logarithm). at_stiffness_range: share at or beyond an end of the
-    stiffness range. factors: common factors.
+    - texels_moved: share of texels that changed by more than a tenth of their initial scale
+    - at_bound: share of springs whose log deviation is within 5 % of its bound
+    - at_stiffness_range: share of springs at or beyond an end of the stiffness range
+    - factors: common factors
     """
     s, figures = parameters.settings, dict[str, Any]()
     with torch.no_grad():
@@ -207,5 +206,5 @@ def movement(parameters: TwinParameters) -> dict[str, Any]:
     return figures
 
 
-def _share(which: torch.Tensor) -> float:
-    return float(which.double().mean())
+def _share(selected: torch.Tensor) -> float:
+    return float(selected.double().mean())

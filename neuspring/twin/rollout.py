@@ -1,4 +1,4 @@
-"""Roll a twin out under recorded controller motion, and the velocity with which that begins."""
+"""Rollouts of a twin under recorded controller motion, and their initial velocity."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from neuspring.physics.solver import FrameSolver
 from neuspring.twin.body import body_of
 
 FAR_AWAY = 1e3
-"""A node this far from the origin has left any plausible scene, m."""
+"""Distance from the origin beyond which a node has left any plausible scene, m."""
 
 
 class Diverged(Exception):
-    """A rollout left every plausible range; carries the frame and what happened."""
+    """A rollout diverged. Contains the frame and the reason."""
 
     def __init__(self, frame: int, reason: str) -> None:
         super().__init__(reason)
@@ -26,8 +26,8 @@ class Diverged(Exception):
 
 
 def left_scene(x: torch.Tensor, frame: int, reach: float, what: str = "node") -> str:
-    """The first of the points [N, 3], m, that is farther than `reach` from the origin, in words; empty where none is."""
-    # NaN compares false, so this catches it together with infinity and absurd distances.
+    """Name the first of the points [N, 3], m, that is farther than `reach` from the origin; an empty string if none is."""
+    # NaN compares false, so it counts as too far.
     near = (x.abs() < reach).all(dim=1)
     return "" if bool(near.all()) else f"{what} {int((~near).nonzero()[0])} left the scene in frame {frame}"
 
@@ -35,9 +35,9 @@ def left_scene(x: torch.Tensor, frame: int, reach: float, what: str = "node") ->
 def frames(
     twin: Twin, solver: FrameSolver, hands: torch.Tensor, velocity: np.ndarray | None = None
 ) -> Iterator[tuple[int, torch.Tensor, torch.Tensor]]:
-    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (controllers.waypoints). Raises Diverged.
+    """Yield (frame, x [N, 3] m, v [N, 3] m/s) for frames 1, 2, ... of hands [T, C, 3] (controllers.waypoints).
 
-    `velocity` [N, 3], m/s, is that of frame 0; none means at rest.
+    `velocity` [N, 3], m/s, is the velocity in frame 0; None: at rest. Raises Diverged.
     """
     x = torch.tensor(twin.topology.nodes, dtype=solver.dtype, device=solver.device)
     v = torch.zeros_like(x) if velocity is None else torch.tensor(velocity, dtype=x.dtype, device=x.device)
@@ -58,10 +58,13 @@ def roll_out(
     *,
     check: bool = True,
 ) -> Trajectory:
-    """Simulate over controller_points [T, C, 3], m, from velocity [N, 3], m/s (none: at rest). Divergence is a named result.
+    """Simulate a twin under the motion of its controllers. Divergence is a result: the trajectory contains the frame and the
+    reason.
 
-    `valid` [T, C]: when each controller holds; empty or none: always. Raises Unstable if the substep is beyond the stability bound,
-    unless `check` is false: the released simulator does not look.
+    - controller_points: [T, C, 3], m
+    - velocity: [N, 3] in frame 0, m/s; None: at rest
+    - valid: [T, C], frames in which each controller holds; empty or None: all frames
+    - check: raise Unstable if the substep exceeds the stability bound; the released simulator does not check
     """
     body = body_of(twin)
     if check:
@@ -87,29 +90,32 @@ def roll_out(
 
 
 SPREAD_NEIGHBORS = 16
-"""Nearest points that a node's value is interpolated from."""
+"""Number of nearest points from which the value of a node is interpolated."""
 SPREAD_SMOOTHING = 1e-6
-"""Keeps the interpolation solvable where two points coincide; in meters, far below any distance between points."""
+"""Smoothing that keeps the interpolation solvable for coincident points, m; far below the distances between points."""
 
 
 def spread(points: np.ndarray, values: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Values [N, 3] at nodes [N, 3], from values [P, 3] at points [P, 3], by linear radial basis functions; P >= 1."""
+    """Interpolate values [P, 3] at points [P, 3] to nodes [N, 3] by linear radial basis functions; P >= 1."""
     from scipy.interpolate import RBFInterpolator
 
-    places, first = np.unique(points.astype(np.float64), axis=0, return_index=True)
+    positions, first = np.unique(points.astype(np.float64), axis=0, return_index=True)
     values = values[first].astype(np.float64)
-    if len(places) == 1:
+    if len(positions) == 1:
         return np.repeat(values, len(nodes), axis=0)
-    interpolate = RBFInterpolator(places, values, min(SPREAD_NEIGHBORS, len(places)), SPREAD_SMOOTHING, "linear")
+    interpolate = RBFInterpolator(positions, values, min(SPREAD_NEIGHBORS, len(positions)), SPREAD_SMOOTHING, "linear")
     return np.asarray(interpolate(nodes.astype(np.float64)))
 
 
 def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.ndarray:
     """Velocity of each node in frame 0 [N, 3], m/s.
 
-    rest: zero, as in the released simulator. observed: (-3 x0 + 4 x1 - x2) / (2 dt) of tracked points and of controllers that hold,
-    exact for constant acceleration, spread over the nodes; (x1 - x0) / dt where frame 2 is not visible or not for training.
-    before: the recorded `velocity_before` of tracked points and controllers, spread alike. Raises InputError where there is none.
+    - rest: zero, as in the released simulator
+    - observed: (-3 x0 + 4 x1 - x2) / (2 dt) of tracks and of controllers that hold, interpolated to the nodes; exact for constant
+      acceleration. If frame 2 is not visible or not a training frame: (x1 - x0) / dt
+    - before: the recorded `velocity_before` of tracks and controllers, interpolated to the nodes
+
+    Raises InputError if `velocity_before` is missing.
     """
     nodes = observations.nodes
     if kind == "rest":
@@ -117,11 +123,10 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
     scenario = observations.scenario
     if kind == "before":
         if not len(observations.velocity_before):
-            rule = "before needs a recording that knows the sample before frame 0"
-            where = f"{scenario.name}, simulation.initial_velocity"
-            raise InputError(where, rule, "none", "Choose observed.")
-        places = np.concatenate([observations.object_points[0], observations.controller_points[0]])
-        return spread(places, observations.velocity_before, nodes)
+            rule = "before needs a recording with velocities from the sample before frame 0"
+            raise InputError(f"{scenario.name}, simulation.initial_velocity", rule, "none", "Choose observed.")
+        points = np.concatenate([observations.object_points[0], observations.controller_points[0]])
+        return spread(points, observations.velocity_before, nodes)
     x, hands = (values[:3].astype(np.float64) for values in (observations.object_points, observations.controller_points))
     visible, valid = observations.object_visibility, observations.object_motion_valid
     once = visible[1] & valid[0]
@@ -137,6 +142,6 @@ def initial_velocity(observations: Observations, kind: InitialVelocity) -> np.nd
 
 
 def holding(observations: Observations, frames: slice) -> np.ndarray:
-    """Which controllers [C] hold the object in all of these frames."""
+    """True for the controllers [C] that hold the object in all of these frames."""
     valid, count = observations.controller_valid, observations.controller_points.shape[1]
     return np.asarray(valid[frames].all(axis=0)) if valid.size else np.ones(count, dtype=bool)

@@ -1,10 +1,13 @@
-"""Zero-order stage: CMA-ES over topology and homogeneous material (as in the released PhysTwin code).
+"""The search: CMA-ES over topology and homogeneous material, as in the released PhysTwin code.
 
-The best candidate wins. With `search.hands: auto` the first generation is judged with hands that hold and with hands that push, and
-the way of its best candidate is kept. Hands that push an object that is held leave it where it is, and first candidates that hold
-may be worse than that: so pushing must also cost less than a body that stays. With `search.tied_rollouts` the first part of the
-budget searches the 12 variables of the uniform topology; then the regions are freed around the best candidate. A trace records
-every candidate. A killed search continues from it, and so does a finished one with a larger budget: CMA-ES is replayed with the
+The best candidate is the result. With `search.hands: auto`, the first generation is evaluated twice: controllers hold, and
+controllers push. The search keeps the mode of the best candidate. Controllers that only push leave a grasped object in place, and
+early candidates that hold may cost more than that. Therefore pushing must also cost less than a static object.
+
+With `search.tied_rollouts`, the first candidates search the 12 variables of the uniform topology. Then the regions become free
+around the best candidate.
+
+A trace records every candidate. A killed search, or a finished one with a larger budget, resumes: it replays CMA-ES with the
 recorded costs.
 """
 
@@ -47,26 +50,26 @@ if TYPE_CHECKING:
 FIRST_STEP = 1 / 6
 """Initial step of CMA-ES in normalized variables."""
 WAYS = {"hold": (False,), "push": (True,), "auto": (False, True)}
-"""Ways of hands that are judged, by `search.hands`: True where they only push."""
+"""Modes of controllers to evaluate, by `search.hands`; True: they only push."""
 FREED_SIGMA = 0.06
-"""Step of CMA-ES in normalized variables when each region becomes free."""
+"""Step of CMA-ES in normalized variables when the regions become free."""
 MUST_MOVE = 0.9
-"""Hands push if that costs less than this fraction of a body that stays as it is in frame 0."""
+"""Fraction of the cost of a static object below which controllers may push."""
 
 
 class Proposals:
     """The candidates of CMA-ES, in all 2K + 10 normalized variables.
 
-    In the first `tied_rollouts` it searches the 12 variables of the uniform topology; then it starts again in all variables, from
-    the best candidate so far. K regions have too many variables for a few hundred rollouts: free from the start, the piecewise
-    search ended above the uniform one on training frames, although its space contains the other's.
+    The first `tied` candidates search the 12 variables of the uniform topology. Then CMA-ES restarts in all variables, from the
+    best candidate. K regions have too many variables for a few hundred rollouts: if they are free from the start, the piecewise
+    search has a higher training loss than the uniform search.
     """
 
     def __init__(self, start: np.ndarray, variables: Sequence[str], tied: int, seed: int) -> None:
-        """From normalized `variables` at `start` [V]; the first `tied` candidates have regions alike."""
+        """Start at `start` [V], normalized `variables`. In the first `tied` candidates, all regions share their values."""
         self._seed, self._tied = seed, tied
         self._columns = np.arange(len(variables))
-        """Which of the searched variables each variable takes its value from."""
+        """Index of the searched variable from which each variable takes its value."""
         searched = start
         if tied:
             shared = [name.partition(".")[0] for name in variables]
@@ -80,7 +83,7 @@ class Proposals:
         self.generation = -1
 
     def ask(self) -> list[np.ndarray]:
-        """The next generation; the last one with tied regions may be cut short."""
+        """Return the next generation. The last generation with tied regions may be shorter."""
         if self._tied and self._evaluated == self._tied:
             self._strategy = _strategy(self._best[1], FREED_SIGMA, self._seed)
             self._columns = np.arange(len(self._best[1]))
@@ -91,7 +94,7 @@ class Proposals:
         return [np.asarray(searched)[self._columns] for searched in self._population]
 
     def tell(self, costs: list[float]) -> None:
-        """Take the costs of the first candidates of the last generation; CMA-ES learns from whole generations only."""
+        """Record the costs of the first candidates of the last generation. CMA-ES is updated only with complete generations."""
         least = int(np.argmin(costs))
         if costs[least] < self._best[0]:
             self._best = (costs[least], np.asarray(self._population[least])[self._columns])
@@ -112,7 +115,7 @@ def _strategy(start: np.ndarray, sigma: float, seed: int) -> cma.CMAEvolutionStr
 
 @dataclass(frozen=True, kw_only=True)
 class SearchResult(Learned):
-    """The best twin found, its variables and cost, and the trace: one row per candidate."""
+    """The best twin, its variables and cost, and the trace: one row per candidate."""
 
     values: dict[str, float]
     cost: float
@@ -121,7 +124,7 @@ class SearchResult(Learned):
 
 @dataclass(frozen=True)
 class SearchRun:
-    """A search, its seed, and the file of its trace, which is continued where it has the same `key`."""
+    """A search, its seed, and the file of its trace. The search resumes from a trace with the same `key`."""
 
     problem: SearchProblem
     seed: int
@@ -130,49 +133,51 @@ class SearchRun:
 
 
 def search(problem: SearchProblem, seed: int, *, record: Path | None = None, key: str = "") -> SearchResult:
-    """Run the search within its budget of rollouts.
+    """Run a search within its budget of rollouts.
 
-    The trace is written to `record` after every generation. A trace with the same `key` that is there already is continued,
-    whatever its budget was. Raises NumericalFailure if no candidate could be simulated.
+    Writes the trace to `record` after every generation, and resumes from an existing trace with the same `key`, whatever its
+    budget. Raises NumericalFailure if no candidate could be simulated.
     """
     result: SearchResult = result_of(search_many([SearchRun(problem, seed, record, key)]))
     return result
 
 
 def search_many(runs: Sequence[SearchRun]) -> list[SearchResult | Exception]:
-    """The result of each search, or the exception that ended it.
+    """Run several searches, generation by generation; return the result of each, or the exception that ended it.
 
-    The searches advance generation by generation. On a GPU their rollouts share launches; on a CPU `threads` of the first problem
-    simulate groups of candidates at the same time.
+    On a GPU their rollouts share launches. On a CPU, `threads` of the first problem simulate groups of candidates at the same
+    time.
     """
     device = runs[0].problem.device
-    with _threads(runs[0].problem.threads) as each:
-        return lockstep([_course(run, each) for run in runs], partial(_roll_out, device, each, share=device != "cpu"))
+    with _threads(runs[0].problem.threads) as parallel_map:
+        return lockstep(
+            [_course(run, parallel_map) for run in runs], partial(_roll_out, device, parallel_map, share=device != "cpu")
+        )
 
 
-def _roll_out(device: str, each: Map, requests: Mapping[int, Sequence[Rollouts]], *, share: bool) -> dict[int, list[Any]]:
-    """Outcomes and seconds of each of the rollouts; those of several searches with one physics `share` a launch."""
-    wanted = [(k, number, one) for k, own in requests.items() for number, one in enumerate(own)]
+def _roll_out(device: str, parallel_map: Map, requests: Mapping[int, Sequence[Rollouts]], *, share: bool) -> dict[int, list[Any]]:
+    """Outcomes and seconds of all rollouts. Rollouts of several searches with the same physics `share` a launch."""
+    entries = [(k, number, item) for k, items in requests.items() for number, item in enumerate(items)]
     launches: dict[Any, list[tuple[int, int, Rollouts]]] = {}
-    for entry in wanted:
-        one = entry[2]
-        together = shared_physics(one.twins[0], one.hands.shape[-1] == 3) if share and len(requests) > 1 else entry[:2]
+    for entry in entries:
+        item = entry[2]
+        together = shared_physics(item.twins[0], item.hands.shape[-1] == 3) if share and len(requests) > 1 else entry[:2]
         launches.setdefault(together, []).append(entry)
 
     def launch(entries: Sequence[tuple[int, int, Rollouts]]) -> list[tuple[int, int, Any]]:
         start = time.perf_counter()
-        results = rolled([one for _, _, one in entries], device)
+        results = rolled([item for _, _, item in entries], device)
         seconds = (time.perf_counter() - start) / len(entries)
         return [(k, number, (result, seconds)) for (k, number, _), result in zip(entries, results, strict=True)]
 
-    # Threads would meet in the one stream of a GPU.
-    simulated = each if device == "cpu" else map
-    found = {(k, number): answer for answers in simulated(launch, launches.values()) for k, number, answer in answers}
-    return {k: [found[k, number] for number in range(len(own))] for k, own in requests.items()}
+    # On a GPU all threads would share one stream.
+    simulated = parallel_map if device == "cpu" else map
+    by_entry = {(k, number): answer for answers in simulated(launch, launches.values()) for k, number, answer in answers}
+    return {k: [by_entry[k, number] for number in range(len(items))] for k, items in requests.items()}
 
 
-def _course(run: SearchRun, each: Map) -> Generator[Any, Any, SearchResult]:
-    """A search that yields the rollouts of its generations."""
+def _course(run: SearchRun, parallel_map: Map) -> Generator[Any, Any, SearchResult]:
+    """A search as a generator of rollouts, one request per generation."""
     clock, problem = time.perf_counter(), run.problem
     settings, variables = problem.search, problem.variables
     recorded, attempts, earlier = recorded_trace(run.record, run.key)
@@ -184,48 +189,48 @@ def _course(run: SearchRun, each: Map) -> Generator[Any, Any, SearchResult]:
     trace: list[dict[str, Any]] = []
 
     def judge(population: Sequence[np.ndarray], push: bool) -> Generator[Any, Any, list[dict[str, Any]]]:
-        """Rows of the first candidates of a generation: those that are recorded, then new ones."""
+        """Rows of a generation: recorded candidates first, then newly evaluated candidates."""
         nonlocal recorded, attempts, earlier
         generation, start = proposals.generation, len(trace)
         known = [row for row in recorded if row["generation"] == generation and row["push"] == push][: len(population)]
         if not replays(known, population, variables):
-            print(f"{run.record}: does not replay on this machine; the search continues afresh from rollout {start}")
+            print(f"{run.record}: the recorded trace does not replay on this machine; the search restarts from rollout {start}")
             known, recorded = [], []
             attempts, earlier = (attempts, earlier) if start else (1, 0.0)
-        fresh = yield from evaluate(problem, population[len(known) :], push, start + len(known), generation, each)
+        fresh = yield from evaluate(problem, population[len(known) :], push, start + len(known), generation, parallel_map)
         return known + fresh
 
-    # One candidate cannot be judged both ways.
+    # A budget of one rollout allows a single mode.
     ways, push = WAYS[settings.hands][:budget], WAYS[settings.hands][0]
     while len(trace) < budget:
-        # The last generation may be cut short, so that searches of any population size use exactly the same budget.
+        # The last generation may be shorter, so that every search uses exactly its budget.
         population = proposals.ask()[: budget - len(trace)]
         if not trace and len(ways) > 1:
             population = population[: budget // len(ways)]
             hold = yield from judge(population, False)
             pushing = yield from judge(population, True)
             push = _pushes(hold, pushing, problem)
-            own, other = (pushing, hold) if push else (hold, pushing)
-            trace = [row | {"stage": OTHER_WAY} for row in other] + own
+            kept, rejected = (pushing, hold) if push else (hold, pushing)
+            trace = [row | {"stage": OTHER_WAY} for row in rejected] + kept
             trace = [row | {"rollout": number} for number, row in enumerate(trace)]
         else:
-            own = yield from judge(population, push)
-            trace += own
+            kept = yield from judge(population, push)
+            trace += kept
         progress.update(len(trace), f"best cost {min(row['cost'] for row in trace):.3e}")
-        proposals.tell([row["cost"] for row in own])
+        proposals.tell([row["cost"] for row in kept])
         if run.record is not None and len(trace) > len(recorded):
             save_trace(run.record, run.key, trace, attempts, earlier + time.perf_counter() - clock)
     return _best(problem, trace, push, attempts, earlier)
 
 
 def _pushes(hold: Sequence[dict[str, Any]], pushing: Sequence[dict[str, Any]], problem: SearchProblem) -> bool:
-    """True if hands push: that must cost less than hands that hold, and than a part of a body that stays."""
+    """True if controllers push: pushing must cost less than holding, and less than `MUST_MOVE` of a static object."""
     least, held = (float(min(row["cost"] for row in rows)) for rows in (pushing, hold))
     return least < held and least < MUST_MOVE * still_cost(problem.recordings)
 
 
 def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, attempts: int, earlier: float) -> SearchResult:
-    """The result of a search with these rows. Raises InputError, NumericalFailure if none could be simulated."""
+    """The result of a search with these rows. Raises InputError or NumericalFailure if no candidate could be simulated."""
     import pandas as pd
 
     table = pd.DataFrame(rows)
@@ -250,7 +255,7 @@ def _best(problem: SearchProblem, rows: Sequence[dict[str, Any]], push: bool, at
         "rollouts": len(table),
         "failed_rollouts": int((table["reason"] != "").sum()),
         "collision_overflow": int(table["collision_overflow"].max()),
-        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(len(one.hands) - 1 for one in problem.recordings),
+        "spring_updates": int((table["springs"] * table["substeps"]).sum()) * sum(len(r.hands) - 1 for r in problem.recordings),
         **twin.counts,
     }
     if held := at_ends(table, problem.variables):
@@ -273,13 +278,13 @@ def _least(trace: pd.DataFrame) -> Any:
 
 
 SURFACES = ("ground_", "contact_")
-"""Beginnings of the names of variables that have no effect where nothing touches."""
+"""Prefixes of variables that have no effect without contact."""
 END = 0.01
-"""Distance from an end of its range, in normalized units, within which a variable counts as held by it."""
+"""Distance from an end of the range, in normalized units, within which a variable counts as at the end."""
 
 
 def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
-    """Variables of the best candidate that lie within `END` of an end of their range; contact is left out."""
+    """Variables of the best candidate within `END` of an end of their range, contact variables excluded."""
     best = _least(trace)
     decisive = [name for name in variables if not name.startswith(SURFACES)]
     return [name for name in decisive if not END <= best[f"normalized.{name}"] <= 1 - END]
@@ -287,9 +292,9 @@ def at_ends(trace: pd.DataFrame, variables: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _threads(count: int) -> Iterator[Map]:
-    """A map that makes and simulates candidates: by `count` threads, or by this one, which an interrupt ends at once.
+    """A map over candidates with `count` threads; a single thread is the calling one, which an interrupt ends immediately.
 
-    Torch has no threads of its own meanwhile, so that `count` cores are busy and no more.
+    Torch uses one thread meanwhile, so that at most `count` cores are busy.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -304,7 +309,7 @@ def _threads(count: int) -> Iterator[Map]:
 
 
 def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int, seconds: float) -> None:
-    """Write the rows of a trace, with what they were made from."""
+    """Write the rows of a trace, with the key of its inputs."""
     import pandas as pd
 
     table = pd.DataFrame(trace)
@@ -313,7 +318,7 @@ def save_trace(path: Path, key: str, trace: list[dict[str, Any]], attempts: int,
 
 
 def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], int, float]:
-    """(rows of the trace, attempts, seconds) of a recorded search with this key; (none, 1, 0) if there is none."""
+    """Read (rows of the trace, attempts, seconds) of a recorded search with this key; ([], 1, 0) if there is none."""
     import pandas as pd
 
     fresh: tuple[list[dict[str, Any]], int, float] = ([], 1, 0.0)
@@ -322,18 +327,18 @@ def recorded_trace(path: Path | None, key: str) -> tuple[list[dict[str, Any]], i
     try:
         table = pd.read_parquet(path)
     except (OSError, ValueError) as error:
-        print(f"{path}: unreadable ({error}); the search starts afresh")
+        print(f"{path}: unreadable ({error}); the search starts over")
         return fresh
     if table.attrs.get("key") != key:
-        print(f"{path}: made with other inputs or settings; the search starts afresh")
+        print(f"{path}: made with other inputs or settings; the search starts over")
         return fresh
-    print(f"continuing the search after {len(table)} rollouts")
+    print(f"resuming the search after {len(table)} rollouts")
     records = [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
     return records, int(table.attrs["attempts"]) + 1, float(table.attrs["seconds"])
 
 
 def replays(rows: list[dict[str, Any]], population: Sequence[np.ndarray], variables: tuple[str, ...]) -> bool:
-    """True where recorded candidates are those that CMA-ES proposes now."""
+    """True if the recorded candidates equal those that CMA-ES proposes now."""
     return all(
         np.array_equal(np.array([row.get(f"normalized.{name}", np.nan) for name in variables]), normalized)
         for row, normalized in zip(rows, population, strict=False)

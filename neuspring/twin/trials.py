@@ -1,9 +1,9 @@
 """Rollouts of several candidates at once, and their training losses (losses.py) without gradients.
 
-Everything stays in the solver's buffers, in lanes: after each frame kernels add the frame's loss to each twin's sum, and note the
-frame in which a twin leaves the scene. Terms without a kernel here come from losses.py, twin by twin. Sums go through points and
-nodes in order, in float64, so that a twin's cost does not depend on its batch, bit for bit on a CPU. Rollouts on several
-recordings, of one scene or of several, may share launches.
+All states stay in the solver's buffers, in lanes. After each frame, kernels add its loss to the sum of each twin and record the
+frame in which a twin leaves the scene. losses.py computes terms without a kernel, twin by twin. Sums are in float64, in the order
+of points and nodes, so on a CPU the cost of a twin does not depend on its batch, bit for bit. Rollouts on several recordings, of
+one or several scenes, may share launches.
 """
 # No postponed annotations here: Warp reads the evaluated types of the closures below.
 
@@ -26,17 +26,17 @@ from neuspring.twin.losses import FrameLoss
 from neuspring.twin.rollout import FAR_AWAY
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}
-"""Frames from one look for twins that all diverged to the next; on CUDA each check synchronizes."""
+"""Frames between two checks whether all twins have diverged; on CUDA each check synchronizes."""
 ON_LANES = ("chamfer", "track", "acceleration")
-"""Terms that have a kernel."""
+"""Terms with a kernel."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a candidate's rollout."""
+    """The result of a candidate's rollout."""
 
     cost: float
-    """Mean training loss over frames 1 .. train_end - 1, m^2, acceleration included; infinite if it left the scene."""
+    """Mean training loss over frames 1 .. train_end - 1, m^2, acceleration included; infinite if a node left the scene."""
     diverged_frame: int
     """The frame in which a node left the scene; 0 if none did."""
     collision_overflow: int
@@ -44,10 +44,11 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """Twins of the same nodes on a recording, to be rolled out from velocity [N, 3], m/s.
+    """Twins with the same nodes, to roll out on a recording.
 
-    hands are the controllers' positions [T, C, 3], or `controllers.waypoints` of them. Each twin is judged (`Outcome`) in the
-    frames that the loss holds.
+    - hands: positions of the controllers [T, C, 3], m, or `controllers.waypoints` of these
+    - velocity: in frame 0 [N, 3], m/s
+    - loss: training loss, whose frames determine the cost
     """
 
     twins: Sequence[Twin]
@@ -56,32 +57,35 @@ class Rollouts:
     loss: FrameLoss
 
 
-def rolled(each: Sequence[Rollouts], device: str) -> list[list[Outcome]]:
-    """Outcomes of several `Rollouts`, whose launches are shared: one physics, and, of several scenes, hands that always hold."""
-    twins = [twin for one in each for twin in one.twins]
+def rolled(batches: Sequence[Rollouts], device: str) -> list[list[Outcome]]:
+    """Roll out several `Rollouts` with shared launches; return the outcomes of each.
+
+    All twins have the same physics. If they are of several scenes, controllers must hold in all frames.
+    """
+    twins = [twin for rollouts in batches for twin in rollouts.twins]
     solver = narrowing_solver(twins, device)
-    firsts = accumulate((len(one.twins) for one in each), initial=0)
-    seen = [
-        LossSums(solver, one.loss, one.velocity, slice(first, first + len(one.twins)))
-        for one, first in zip(each, firsts, strict=False)
+    firsts = accumulate((len(rollouts.twins) for rollouts in batches), initial=0)
+    losses = [
+        LossSums(solver, rollouts.loss, rollouts.velocity, slice(first, first + len(rollouts.twins)))
+        for rollouts, first in zip(batches, firsts, strict=False)
     ]
-    for frame in _frames(solver, each, max(len(one.hands) for one in each)):
-        for one, sums in zip(each, seen, strict=True):
-            if frame < len(one.hands):
+    for frame in _frames(solver, batches, max(len(rollouts.hands) for rollouts in batches)):
+        for rollouts, sums in zip(batches, losses, strict=True):
+            if frame < len(rollouts.hands):
                 sums.add(frame)
-        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and all(sums.ended for sums in seen):
+        if frame % CHECK_EVERY[device.partition(":")[0]] == 0 and all(sums.ended for sums in losses):
             break
-    return [sums.result(len(one.hands) - 1) for one, sums in zip(each, seen, strict=True)]
+    return [sums.result(len(rollouts.hands) - 1) for rollouts, sums in zip(batches, losses, strict=True)]
 
 
-def _frames(solver: FrameSolver, each: Sequence[Rollouts], count: int) -> Iterator[int]:
-    """Simulate frame after frame: 1, 2, ... while the solver holds its end. The hands of a shorter recording stay at its end."""
-    union = Union([twin.topology for one in each for twin in one.twins])
-    nodes = [torch.tensor(one.twins[0].topology.nodes, device=solver.device) for one in each for _ in one.twins]
-    velocities = [one.velocity for one in each for _ in one.twins]
+def _frames(solver: FrameSolver, batches: Sequence[Rollouts], count: int) -> Iterator[int]:
+    """Simulate frames 1, 2, ...; yield each while the solver contains its end. Controllers of shorter recordings then rest."""
+    union = Union([twin.topology for rollouts in batches for twin in rollouts.twins])
+    nodes = [torch.tensor(rollouts.twins[0].topology.nodes, device=solver.device) for rollouts in batches for _ in rollouts.twins]
+    velocities = [rollouts.velocity for rollouts in batches for _ in rollouts.twins]
     solver.start(union.of_nodes(nodes, places=True), union.of_nodes(velocities))
-    lasting = [torch.cat([one.hands, one.hands[-1:].expand(count - len(one.hands), -1, -1)]) for one in each]
-    hands = union.of_controllers([path for one, path in zip(each, lasting, strict=True) for _ in one.twins])
+    padded = [torch.cat([r.hands, r.hands[-1:].expand(count - len(r.hands), -1, -1)]) for r in batches]
+    hands = union.of_controllers([path for rollouts, path in zip(batches, padded, strict=True) for _ in rollouts.twins])
     for frame in range(1, count):
         solver.advance(hands[frame - 1], hands[frame])
         yield frame
@@ -89,7 +93,7 @@ def _frames(solver: FrameSolver, each: Sequence[Rollouts], count: int) -> Iterat
 
 
 class LossSums:
-    """The sums of a population's losses, on its device; the population is all twins of a solver, or some."""
+    """The sums of the losses of some or all twins of a solver, on its device."""
 
     def __init__(self, solver: FrameSolver, loss: FrameLoss, velocity: torch.Tensor, twins: slice = slice(None)) -> None:
         b = self._buffers = solver.buffers.part(twins)
@@ -109,7 +113,7 @@ class LossSums:
         self._other_terms = torch.zeros(b.twins, dtype=torch.float64, device=b.device)
 
     def add(self, frame: int) -> None:
-        """Add the loss of a frame, whose end the solver holds."""
+        """Add the loss of a frame, whose end the solver contains."""
         b, views = self._buffers, self._buffers.views
         nearest, tracked, smooth, total, check_divergence = self._kernels
         points, slot, weights = self._points.shape[1], self._solver.last, self._loss.weights
@@ -125,7 +129,7 @@ class LossSums:
         ):
             b.launch(total, b.groups, views[name], size, weight, self._view)
         if self._others:
-            # One twin at a time, so that its sum does not depend on its batch.
+            # Twin by twin, so that a sum does not depend on the batch.
             for twin, nodes in enumerate(b.get_vectors("x", slot, b.nodes)):
                 terms = self._loss.terms(frame, nodes, without=ON_LANES).values()
                 self._other_terms[twin] += sum(term.double() for term in terms)
@@ -138,11 +142,11 @@ class LossSums:
 
     @property
     def ended(self) -> bool:
-        """True where all twins have left the scene."""
+        """True if all twins have left the scene."""
         return bool(self.diverged.all())
 
     def result(self, frames: int) -> list[Outcome]:
-        """The outcome of each twin after so many frames."""
+        """The outcome of each twin after `frames` frames."""
         totals = self._buffers.of_twins(self._total.reshape(-1)) + self._other_terms
         ends = zip(totals.tolist(), self.diverged.tolist(), self._solver.overflows[self._twins], strict=True)
         return [Outcome(math.inf if frame else total / frames, int(frame), overflow) for total, frame, overflow in ends]
@@ -155,8 +159,8 @@ def kernels(width: int) -> list[Any]:
     nearest           squared distance of each visible point to the nearest surface node
     tracked           smooth-L1 between each tracked point and its node, summed over axes
     smooth            smooth-L1 between consecutive velocity changes of each node, summed over axes
-    total             add a weighted sum to each twin's cost
-    check_divergence  note the first frame in which a twin is out of the scene
+    total             adds a weighted sum to each twin's cost
+    check_divergence  records the first frame in which a twin has left the scene
     """
     lane = lanes(wp.float32, width)
     Number, Vector, dot = lane.Number, lane.Vector, lane.dot
@@ -237,7 +241,7 @@ def kernels(width: int) -> list[Any]:
         for i in range(nodes):
             for q in range(width):
                 for row in range(3):
-                    # Not a number is not near either.
+                    # NaN also counts as too far.
                     if not (wp.abs(x[slot, i, g][row, q]) < far):
                         largest[q] = one
         for q in range(width):

@@ -174,7 +174,7 @@ def test_a_full_disk_is_one_message_with_the_file_the_disk_and_how_to_go_on(monk
     status, text = stopped_by(monkeypatch, capsys, lambda: files.write_text(path, "text"))
     assert status == 1
     where = rf"neuspring: error: {re.escape(str(path))}: no space left on device: the disk at /\S* has [\d.]+ of [\d.]+ GB free\. "
-    remedy = r"Free some space there; the same command continues, and what is finished is kept\.\n"
+    remedy = r"Free some space there, then rerun the same command to resume\.\n"
     assert re.fullmatch(where + remedy, text)
 
 
@@ -184,7 +184,7 @@ def test_ctrl_c_is_a_line_that_says_what_is_kept_and_no_cause_of_failure(monkeyp
 
     status, text = stopped_by(monkeypatch, capsys, pressed)
     assert status == 130
-    assert text == "neuspring: stopped. Start it again; searches and fits go on from their checkpoints.\n"
+    assert text == "neuspring: interrupted. Rerun the same command; searches and fits resume from their checkpoints.\n"
 
 
 def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(monkeypatch, capsys):

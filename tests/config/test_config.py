@@ -72,19 +72,19 @@ MISTAKES = {
         "search: {rollouts: 9, tied_rollouts: 9}",
         "tied_rollouts must be below rollouts (9), received 9",
     ),
-    "start outside": ("search: {variables: {drag: {start: 60}}}", "variables.drag: start = 60.0 lies outside [0.05, 50.0]"),
+    "start outside": ("search: {variables: {drag: {start: 60}}}", "variables.drag: start must be in [0.05, 50.0], received 60.0"),
     "log scale from zero": (
         "search: {variables: {stiffness: {low: 0.0}}}",
-        "variables.stiffness: scale log needs a positive low, received 0.0",
+        "variables.stiffness: scale log requires a positive low, received 0.0",
     ),
-    "a fixed stranger": ("search: {fixed: [mass]}", "fixed: different ones of stiffness, object_radius", "received ['mass']"),
+    "a fixed stranger": ("search: {fixed: [mass]}", "fixed: entries must be different variables (", "received ['mass']"),
     "unknown key in a list": (
         "aims: [{method: a, baseline: b, ratio: 1.0, bellow: 1}]",
         "aims.0.bellow: unknown key (did you mean below?)",
     ),
     "a password on command lines": (
         "tracking: {uri: 'http://me:secret@host:5000'}",
-        "tracking: uri: a password would be shown by ps and in logs; set PGPASSWORD, ~/.pgpass or MLFLOW_TRACKING_PASSWORD instead",
+        "tracking: uri: must not contain a password, because ps and logs would show it; set PGPASSWORD, ~/.pgpass or",
         "***@host",
     ),
     "duplicate seeds": ("seeds: [1, 1]", "seeds: entries must differ, received [1, 1]"),

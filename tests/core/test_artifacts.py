@@ -112,7 +112,7 @@ BROKEN = {
     "frames": (lambda: observations(scenario=scenario(frame_count=6)), r"declares 6 frames; received arrays of 5 frames"),
     "no points": (lambda: observations(points=0), r"at least one tracked object point"),
     "hidden at rest": (lambda: observations(object_visibility=np.zeros((5, 3), bool)), r"visible in frame 0.*3 of 3 are not"),
-    "index": (lambda: topology(springs=np.array([[0, 1], [1, 2], [5, 3]])), r"topology\.springs: indices must lie in \[0, 5\)"),
+    "index": (lambda: topology(springs=np.array([[0, 1], [1, 2], [5, 3]])), r"topology\.springs: indices must be in \[0, 5\)"),
     "order": (lambda: topology(springs=np.array([[0, 1], [4, 2], [1, 3]])), r"object springs must come before controller springs"),
     "zero length": (lambda: topology(rest_lengths=np.array([0.1, 0.0, 0.3])), r"received 0\.0 m for spring 1 between \[1, 2\]"),
     "negative stiffness": (lambda: material(stiffness=np.array([1.0, -2, 1])), r"stiffness: must not be negative; received -2"),
@@ -124,7 +124,7 @@ BROKEN = {
     ),
     "masses": (lambda: dataclasses.replace(twin(), material=material(mass=np.ones(3))), r"one mass per node \(4\), or none"),
     "no mass": (lambda: material(mass=np.array([1.0, 0.0])), r"material\.mass: must be positive"),
-    "rest shape": (lambda: topology(rest_shape=np.ones((4, 3))), r"rest_shape: one position per node and controller \(5\)"),
+    "rest shape": (lambda: topology(rest_shape=np.ones((4, 3))), r"rest_shape: must contain one position per node and .*\(5\)"),
     "frames of a trajectory": (lambda: trajectory(frame_count=4), r"trajectory\.positions: 4 frames are expected; received 3"),
 }
 
@@ -160,7 +160,7 @@ def refuses(kind, path, message):
 
 
 def test_a_missing_file(tmp_path):
-    refuses(Twin, tmp_path / "no.npz", "must be of kind twin; received no such file. Run the step that makes it first")
+    refuses(Twin, tmp_path / "no.npz", "must be of kind twin; received no such file. Run the step that writes it first")
     refuses(Twin, tmp_path, "no such file")
 
 
@@ -169,7 +169,7 @@ def test_another_kind_or_version(tmp_path):
     twin().save(path)
     refuses(Trajectory, path, r"must be of kind trajectory, format 2; received \('twin', 2\)")
     rewrite(path, format=99)
-    refuses(Twin, path, r"received \('twin', 99\)\. Re-run")
+    refuses(Twin, path, r"received \('twin', 99\)\. Rerun")
 
 
 def test_what_is_optional_may_be_missing_in_a_file(tmp_path):
@@ -188,7 +188,7 @@ def test_fields_of_another_version_are_refused(tmp_path, part, name):
         kept = json.loads(stored["meta"].tobytes())["fields"]
     kept[part][name] = 0.0
     rewrite(path, fields=kept)
-    refuses(Twin, path, f"and no other.*{name}.*Run the step that makes it again")
+    refuses(Twin, path, f"and no others.*{name}.*rerun the step that writes it")
 
 
 def test_missing_fields(tmp_path):
@@ -205,7 +205,7 @@ def test_missing_fields(tmp_path):
 
 def damaged(path, content):
     path.write_bytes(content)
-    refuses(Twin, path, r"must be readable, of kind twin.*Delete it and re-run its step")
+    refuses(Twin, path, r"must be readable and of kind twin.*Delete it and rerun its step")
 
 
 def test_truncated_files(tmp_path):

@@ -23,7 +23,7 @@ def test_a_foreign_or_damaged_checkpoint_is_left_alone(tmp_path, capsys):
     Checkpoint({"values": {"a": np.zeros(2)}}, {}).save(path, "another key")
     whole = path.read_bytes()
     assert Checkpoint.load(path, "key", "the fit") is None
-    assert "made with other inputs or settings; the fit starts afresh" in capsys.readouterr().out
+    assert "made with other inputs or settings; the fit starts over" in capsys.readouterr().out
     for content in (b"", b"hello", whole[: len(whole) // 2], whole.replace(b"another", b"\xff" * 7)):
         path.write_bytes(content)
         assert Checkpoint.load(path, "another key", "the fit") is None
@@ -44,7 +44,7 @@ def test_a_killed_loop_continues_after_its_last_checkpoint(tmp_path, capsys, mon
         if number == 2:
             break
     second = loop()
-    assert "continuing the training after epoch 1" in capsys.readouterr().out
+    assert "resuming the training after epoch 1" in capsys.readouterr().out
     assert second.restored.values == {"state": 2} and second.attempts == 2
     assert second.earlier_seconds > 0
     for number in second:

@@ -39,7 +39,7 @@ def search_in_pods(project, cores=None):
 def test_cores_are_refused_before_any_pod(project, tmp_path):
     variables = kubectl(tmp_path / "bin", f'touch "{tmp_path / "called"}"')
     output = output_of(start(search_in_pods(project, cores=2), project, **variables), fails=True)
-    assert "--cores: a cluster's scheduler counts cores itself" in output
+    assert "--cores: must not be set on a cluster" in output
     assert not (tmp_path / "called").exists()
 
 

@@ -66,7 +66,7 @@ def test_a_change_leaves_the_steps_before_it_alone(perceived_run, tmp_path):
     assert jobs_in(run(project, changes, "--until", "perceive")) == {"perceive": 1}
     [log] = (project / "results" / "jobs" / "perceive").rglob("*.log")
     lines = dict(line.split(": ", 1) for line in log.read_text().splitlines() if ": " in line)
-    assert lines["segment"] == lines["track"] == lines["lift"] == lines["judge"] == "finished before" != lines["observe"]
+    assert lines["segment"] == lines["track"] == lines["lift"] == lines["judge"] == "already finished" != lines["observe"]
 
 
 @pytest.mark.slow

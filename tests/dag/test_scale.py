@@ -70,7 +70,7 @@ def test_a_study_named_like_another_target_is_refused(project):
     study = {"title": "t", "reference": None, "baseline": "a", "rows": {"a": "baseline"}}
     (project / "config" / "other.yaml").write_text(json.dumps({"fit": study}))
     output = run(project, {"study_table": "config/other.yaml"}, "--dry-run", fails=True)
-    assert "study fit: this is the name of another target; rename the study" in output
+    assert "study fit: another target has this name; rename the study" in output
 
 
 @pytest.mark.slow

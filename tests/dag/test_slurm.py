@@ -119,4 +119,4 @@ def test_a_cancelled_job_is_submitted_again_with_more_memory_and_goes_on_from_it
     assert [int(job["MinMemoryNode"].removesuffix("M")) for job in (first, second)] == [8000, 16000]
     name = f"{SCENE}/baseline/0"
     assert json.loads((results / name / "fit.json").read_text())["attempts"] == 2
-    assert "continuing the fit after epoch" in next((results / "jobs" / "fit" / name).glob("*.log")).read_text()
+    assert "resuming the fit after epoch" in next((results / "jobs" / "fit" / name).glob("*.log")).read_text()

@@ -43,7 +43,7 @@ def test_variants_end_in_one_table_and_a_larger_budget_continues_the_search(proj
     changes |= {"search": {"rollouts": 15}, "methods": ["pt_only"], "seeds": [0], "transfers": {}, "only": ""}
     run(project, changes, "--until", "run")
     logs = (project / "results" / "jobs" / "search").rglob("*.log")
-    assert any("continuing the search after 11 rollouts" in log.read_text() for log in logs)
+    assert any("resuming the search after 11 rollouts" in log.read_text() for log in logs)
     assert len(pd.read_parquet(results / SCENE / "search-piecewise_5" / "0" / "trace.parquet")) == 15
 
 

@@ -88,7 +88,7 @@ def test_a_killed_run_continues_in_the_middle_of_the_fit_and_ends_the_same(tiny_
 
     run(project, changes, "--until", "fit")
     [log] = (project / "results" / "jobs" / "fit").rglob("*.log")
-    assert "continuing the fit after epoch" in log.read_text()
+    assert "resuming the fit after epoch" in log.read_text()
     assert json.loads((folder / "fit.json").read_text())["attempts"] == 2
     expected = Twin.load(undisturbed / "results" / SCENE / "baseline" / "0" / "twin.npz")
     np.testing.assert_array_equal(Twin.load(folder / "twin.npz").material.stiffness, expected.material.stiffness)

@@ -78,7 +78,7 @@ def test_several_jobs_share_a_device_only_where_that_is_allowed(tmp_path):
     first = [gpus.acquire(1, ("0", "1"), jobs_per_gpu=2, folder=tmp_path) for _ in range(4)]
     # Spread before shared.
     assert [lease.devices[0] for lease in first] == ["0", "1", "0", "1"]
-    with pytest.raises(TimeoutError, match="no 1 of the GPUs 0, 1 became free"):
+    with pytest.raises(TimeoutError, match="fewer than 1 of the GPUs 0, 1 became free"):
         gpus.acquire(1, ("0", "1"), jobs_per_gpu=2, folder=tmp_path, timeout=0)
     first[2].release()
     assert gpus.acquire(1, ("0", "1"), jobs_per_gpu=2, folder=tmp_path, timeout=0).devices == ("0",)
@@ -90,7 +90,7 @@ def test_a_job_gets_all_its_devices_or_holds_none(tmp_path):
         gpus.acquire(2, ("0", "1"), folder=tmp_path, timeout=0)
     other = gpus.acquire(1, ("0", "1"), folder=tmp_path, timeout=0)
     assert {*one.devices, *other.devices} == {"0", "1"}
-    with pytest.raises(InputError, match="a job needs 3 GPUs, more than there are; received 2"):
+    with pytest.raises(InputError, match="the job requires 3 GPUs, more than this run may use; received 2"):
         gpus.acquire(3, ("0", "1"), folder=tmp_path)
 
 
@@ -118,7 +118,7 @@ def test_a_lost_device_is_passed_over_and_not_waited_for(run):
     messages = []
     lease = run(1, ("0", "1"), say=messages.append)
     assert lease.devices == ("1",)
-    assert messages == ["passed over: GPU 0 (lost)"]
+    assert messages == ["skipped: GPU 0 (lost)"]
     # Device 0 has no holder; the next job waits for the other one all the same.
     with pytest.raises(TimeoutError):
         run(1, ("0", "1"), timeout=0)
@@ -128,7 +128,7 @@ def test_a_lost_device_is_passed_over_and_not_waited_for(run):
 
 def test_too_few_devices_that_are_not_lost_are_an_error_and_no_endless_wait(run):
     fail_on("0", run)
-    with pytest.raises(InputError, match=r"needs 2 of the GPUs 0, 1, and too few are left; received GPU 0 \(lost\).*nvidia-smi"):
+    with pytest.raises(InputError, match=r"requires 2 working GPUs of 0, 1; received GPU 0 \(lost\).*nvidia-smi"):
         run(2, ("0", "1"))
     fail_on("1", run)
     with pytest.raises(InputError, match=r"received GPU 0 \(lost\), GPU 1 \(lost\)"):
@@ -142,7 +142,7 @@ def test_a_device_lost_while_others_wait_for_it_ends_their_wait(run):
         lease.note(gpus.LOST_GPU)
         lease.release()
 
-    with pytest.raises(InputError, match="too few are left"):
+    with pytest.raises(InputError, match="requires 1 working GPUs of 0"):
         run(1, ("0",), timeout=20, say=lose)
 
 

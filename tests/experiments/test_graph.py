@@ -133,11 +133,11 @@ def test_batches_on_gpus_are_as_large_as_one_another_and_every_gpu_has_one(tmp_p
 
 def test_what_cannot_be_planned_is_an_error(tmp_path):
     graph = planned(tmp_path)
-    with pytest.raises(InputError, match="must be scenario/method/seed"):
+    with pytest.raises(InputError, match="must have the form scenario/method/seed"):
         graph.unit("run", "nothing")
-    with pytest.raises(InputError, match="the target sweep needs a sweep"):
+    with pytest.raises(InputError, match="is required for the target sweep"):
         graph.unit("sweep_report", "all")
-    with pytest.raises(InputError, match="--cores: a cluster's scheduler counts cores itself"):
+    with pytest.raises(InputError, match="--cores: must not be set on a cluster"):
         messages.begin(graph, 1, local=False, cores=2, cluster=False)
 
 

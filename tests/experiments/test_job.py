@@ -51,7 +51,7 @@ def test_a_run_ends_with_its_record_and_the_same_plan_has_nothing_left(own, caps
     assert again.todo(again.runs()) == []
     before = moments(results)
     run(again, "run", f"{SCENE}/static/0")
-    assert moments(results) == before and capsys.readouterr().out.count("finished before") == 2
+    assert moments(results) == before and capsys.readouterr().out.count("already finished") == 2
     record = JobRecord.load(again.record(again.runs()[0]))
     assert (record.outcome, record.scenario, record.log.split("/")[0]) == ("ok", SCENE, "jobs")
     assert set(record.made_of) == {"predict", "score"} and len(record.files) == 2

@@ -53,7 +53,7 @@ def test_without_a_checkout_it_is_found_where_the_installation_put_it(tmp_path, 
     monkeypatch.setattr(local, "PACKAGE_FOLDER", tmp_path / "lib" / "neuspring")
     snakefile = tmp_path / "share" / "neuspring" / "Snakefile"
     monkeypatch.setattr(local, "files", lambda name: [Placed(tmp_path / "README.md"), Placed(snakefile)])
-    with pytest.raises(InputError, match="the package must have its Snakefile"):
+    with pytest.raises(InputError, match="the package must contain its Snakefile"):
         local.workflow_folder()
     snakefile.parent.mkdir(parents=True)
     snakefile.touch()

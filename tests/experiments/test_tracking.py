@@ -102,7 +102,7 @@ def test_the_page_opens_with_scores_as_columns_and_says_what_is_missing(results,
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection:
         counted = {table for (table,) in connection.execute("SELECT tbl FROM sqlite_stat1")}
     assert {"runs", "latest_metrics"} <= counted, "SQLite plans with statistics"
-    with pytest.raises(InputError, match=r"must hold runs .*--results"):
+    with pytest.raises(InputError, match=r"must contain runs .*--results"):
         tracking_store.page(tmp_path / "elsewhere", SETTINGS)
 
 
@@ -111,7 +111,7 @@ def test_a_database_of_another_version_is_named_with_what_to_do(results):
     (results / "mlartifacts").mkdir()
     with contextlib.closing(sqlite3.connect(results / "mlflow.db")) as connection, connection:
         connection.execute("UPDATE alembic_version SET version_num = 'ffffffffffff'")
-    message = r"out-of-date database schema .*rename .*mlflow\.db; `neuspring sync`"
+    message = r"out-of-date database schema .*rename .*mlflow\.db and run `neuspring sync`"
     with pytest.raises(InputError, match=message):
         tracking_store.page(results, SETTINGS)
     assert re.search(message, tracking.init(results, SETTINGS)["outcome"])

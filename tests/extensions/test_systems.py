@@ -158,7 +158,7 @@ def test_all_that_training_reads_is_in_its_record(seen):
 
 
 def test_what_is_missing_is_named(seen):
-    with pytest.raises(InputError, match="only gs_dynamics, spring_gaus are trained"):
+    with pytest.raises(InputError, match="must be a model with training: gs_dynamics, spring_gaus"):
         train(observations=seen, model="static", settings=settings(), seed=0, device="cpu", output=seen.with_name("train.json"))
     with pytest.raises(InputError, match="supervision: masks needs --capture"):
         train(
@@ -170,7 +170,7 @@ def test_what_is_missing_is_named(seen):
             output=seen.with_name("train.json"),
         )
     out = seen.with_name("rollout.json")
-    with pytest.raises(InputError, match="model gs_dynamics is trained first"):
+    with pytest.raises(InputError, match="model gs_dynamics requires a training"):
         predict(observations=seen, model="gs_dynamics", train=None, appearance=None, device="cpu", output=out)
 
 

@@ -110,7 +110,7 @@ def test_specks_and_depth_out_of_range_are_cleaned_away(scene, monkeypatch):
 
 
 def test_no_object_and_no_hand_are_named(scene):
-    for label, message in ((OBJECT, "at least one tracked point must lie on"), (HANDS, "at least 3 points of the hands")):
+    for label, message in ((OBJECT, "at least one tracked point must be on"), (HANDS, "at least 3 points of the hands")):
         labels = np.where(masks_of(scene)["0"].labels == label, 0, masks_of(scene)["0"].labels).astype(np.uint8)
         with pytest.raises(InputError, match=message):
             lifting.lift_tracks(scene, {"0": Masks(labels=labels, backend="x")}, tracks_of(scene), SETTINGS)

@@ -33,9 +33,9 @@ def test_marks_that_are_not_there_lead_to_the_browser(tmp_path):
     [
         ({"label": "cat"}, r"label.*'object', 'hand', 'ignore' or 'person'.*received 'cat'"),
         ({"frame": -1}, "frame.*greater than or equal to 0"),
-        ({"points": ((1, 2),)}, "a box needs 2 points; received 1"),
-        ({"points": ((1, 2), (1.5, 9))}, "corners of a box must be a pixel or more apart"),
-        ({"kind": "polygon"}, "a polygon needs 3 points or more; received 2"),
+        ({"points": ((1, 2),)}, "a box must have 2 points; received 1"),
+        ({"points": ((1, 2), (1.5, 9))}, "corners of a box must be at least one pixel apart"),
+        ({"kind": "polygon"}, "a polygon must have 3 points or more; received 2"),
         ({"radius": 0}, "radius.*greater than 0"),
     ],
 )
@@ -53,10 +53,10 @@ def test_a_mark_that_cannot_be_is_refused_in_a_file_and_in_python(tmp_path, chan
     ("camera", "own", "message"),
     [
         ("7", mark("object", "click", [(5, 5)]), r"cameras\.7: the capture must have this camera; received \['0'\]"),
-        ("0", mark("object", "click", [(5, 5)], frame=6), r"marks\.json, cameras\.0\[0\]\.frame: must lie below 6.*received 6"),
-        ("0", mark("object", "click", [(5, 5)], frame=3), "must lie on frames that the camera has; received 3"),
-        ("0", mark("object", "click", [(160, 5)]), r"points: must lie in the image of 160 x 90 pixels; received \[160"),
-        ("0", mark("hand", "click", [(5, 5)]), r"an object must be marked in one frame or more; received \['hand'\]"),
+        ("0", mark("object", "click", [(5, 5)], frame=6), r"marks\.json, cameras\.0\[0\]\.frame: must be below 6.*received 6"),
+        ("0", mark("object", "click", [(5, 5)], frame=3), "must be on recorded frames; received 3"),
+        ("0", mark("object", "click", [(160, 5)]), r"points: must be inside the image of 160 x 90 pixels; received \[160"),
+        ("0", mark("hand", "click", [(5, 5)]), r"an object must be annotated in at least one frame; received \['hand'\]"),
     ],
 )
 def test_marks_that_do_not_fit_the_capture_are_refused(capture, camera, own, message):

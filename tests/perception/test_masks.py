@@ -72,7 +72,7 @@ def test_masks_of_another_tool_become_those_of_a_capture(folder, tmp_path, capsy
 def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     truth = folder / "truth"
     assert main(["mask", str(folder), "--masks", str(truth / "0")]) == 2
-    assert "a folder is required for each of the cameras 0 1; --cameras chooses some; received 1 and 0" in capsys.readouterr().err
+    assert "one folder is required per camera (0 1); --cameras selects cameras; received 1 and 0" in capsys.readouterr().err
     whole = cv2.imread(str(truth / "0" / "00000.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(truth / "0" / "00000.png"), whole[::2, ::2])
     assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
@@ -80,7 +80,7 @@ def test_masks_of_another_tool_that_do_not_fit(folder, capsys):
     cv2.imwrite(str(truth / "0" / "00000.png"), whole)
     (truth / "0" / "00004.png").rename(truth / "0" / "00044.png")
     assert main(["mask", str(folder), "--masks", str(truth / "0"), "--cameras", "0"]) == 2
-    assert "a mask of frame 4 of camera 0 is required, with its number as the name: 00004.png; received" in capsys.readouterr().err
+    assert "a mask of frame 4 of camera 0 is required, named by its frame number: 00004.png; received" in capsys.readouterr().err
 
 
 @with_extensions
@@ -104,14 +104,14 @@ def test_marks_become_the_masks_of_a_capture(folder, capsys):
 
     times = {path: path.stat().st_mtime_ns for path in (folder / "mask").rglob("*.png")}
     assert main(["mask", str(folder)]) == 0
-    assert "camera 0: marks, images and settings are unchanged; its masks are kept" in capsys.readouterr().out
+    assert "camera 0: annotations, images and settings are unchanged; its masks are kept" in capsys.readouterr().out
     assert times == {path: path.stat().st_mtime_ns for path in (folder / "mask").rglob("*.png")}
 
     marks = Marks.load(folder / "marks.json")
     Marks(cameras=marks.cameras | {"1": (*marks.of("1"), mark("ignore", "click", [(2, 2)]))}).save(folder / "marks.json")
     assert main(["mask", str(folder)]) == 0
     out = capsys.readouterr().out
-    assert "camera 0: marks, images and settings are unchanged" in out
+    assert "camera 0: annotations, images and settings are unchanged" in out
     assert "camera 1: masks are in" in out
 
 
@@ -162,10 +162,10 @@ def test_frames_have_heights_above_the_table(folder):
 def test_a_camera_without_marks_and_damaged_files_are_named(folder, capsys):
     Marks(cameras={"0": Marks.load(folder / "marks.json").of("0")}).save(folder / "one.json")
     assert main(["mask", str(folder), "--marks", str(folder / "one.json"), "--cameras", "1"]) == 2
-    assert "camera 1 needs marks; received ['0']" in capsys.readouterr().err
+    assert "camera 1 requires annotations; received ['0']" in capsys.readouterr().err
     (folder / "masks.json").write_text("[]")
     assert main(["mask", str(folder)]) == 2
-    assert "masks.json: a JSON object is required; received list. Delete it; the masks are made again." in capsys.readouterr().err
+    assert "masks.json: a JSON object is required; received list. Delete this file" in capsys.readouterr().err
 
 
 def test_masks_are_compared_frame_by_frame(folder, capsys):

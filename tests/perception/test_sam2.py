@@ -145,7 +145,7 @@ def test_sam2_carries_marks_both_ways_and_skips_missing_frames(capture):
 
 
 def test_marks_without_an_object_start_nothing(capture):
-    with pytest.raises(InputError, match=r"an object must be marked.*received \['hand'\]"):
+    with pytest.raises(InputError, match=r"an object must be annotated.*received \['hand'\]"):
         segment_sam2.carry(
             capture, "0", [mark("hand", "click", [(5, 5)])], None, GroundedSam2(), "cpu", Models(None, None, None, None)
         )

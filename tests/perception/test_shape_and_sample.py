@@ -124,7 +124,7 @@ def test_a_mesh_must_fit_what_was_seen(toy, kind, start, fits):
     placed = size * turn.apply(mesh.vertices - center) + shift
     placed *= [1.5 if kind == "long" else 1.0, 1, 1]
     placed -= [0, 0, 0.05 if kind == "sunk" else 0.0]
-    said = nullcontext() if fits else pytest.raises(InputError, match="the mesh must fit what was seen: RMS distance at most 9 mm")
+    said = nullcontext() if fits else pytest.raises(InputError, match="observed points: RMS distance at most 9 mm")
     with said:
         shape.require_fit("mesh.ply", placed, rms, seen, 1.0)
 

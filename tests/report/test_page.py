@@ -90,12 +90,14 @@ def test_the_page_holds_together_and_names_nothing_outside_itself(page, full):
 
 def test_the_verdict_comes_first_then_last_frames_and_films_and_the_rest_is_folded(page, full):
     titles = re.findall(r"<h2>(.*?)</h2>", page)
-    assert titles[:4] == ["Verdict", "Last frame", "Film", "Scores"]
+    assert titles[:4] == ["Verdict", "Last frame", "Videos", "Scores"]
     assert re.findall(r'<details class="part"><summary><h2>(.*?)</h2>', page) == titles[3:]
-    rest = ["Scores", "The paper&#39;s tables", "Settings and versions", "Failures", "Time and hardware", "Curves"]
+    rest = ["Scores", "The paper&#39;s tables", "Settings and versions", "Failures", "Time and memory", "Error and loss curves"]
     assert titles[3:] == rest
     text = section(page, "verdict")
-    assert text.startswith("Verdict No method is ahead. NeuSpring ( neuspring ) has 0.")
+    assert text.startswith(
+        "Verdict No method is ahead (too few objects): the track error on future frames of NeuSpring ( neuspring ) is 0."
+    )
     runs = " ".join(str(full / "rope" / method / "0") for method in ("baseline", "neuspring"))
     assert f'<pre tabindex="0" class="whole">{program("neuspring")} play {runs}</pre>' in page
     for key in ("verdict", "strip", "scores", "pictures", "failures", "work"):
@@ -164,7 +166,7 @@ def test_a_package_adds_a_section_that_stands_where_it_says(monkeypatch, small):
 
 def test_an_empty_folder_and_missing_runs_are_said(tmp_path, small):
     (tmp_path / "empty").mkdir()
-    assert "Nothing to report yet: empty holds no run" in section(report(tmp_path / "empty"), "verdict")
+    assert "Nothing to report yet: the folder empty contains no runs." in section(report(tmp_path / "empty"), "verdict")
     with pytest.raises(InputError, match="must exist"):
         write(tmp_path / "absent", tmp_path / "report.html", Options())
     with pytest.raises(InputError, match="must be among the methods"):

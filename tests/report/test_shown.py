@@ -37,13 +37,16 @@ def test_folders_that_cannot_be_shown_are_refused_with_the_next_move(scenario, t
     for name in ("nothing_there", "."):
         with pytest.raises(InputError, match="Give results/<scenario>"):
             find([tmp_path / name])
-    with pytest.raises(InputError, match="all runs must be of one scenario"):
+    with pytest.raises(InputError, match="all runs must belong to one scenario"):
         find([scenario, results(tmp_path / "more")])
 
 
 @pytest.mark.parametrize(
     ("old", "new", "note"),
-    [('"format": 2', '"format": 1', "reads records of format 2"), ('"trajectory.npz"', '"../../../secret.npz"', "must lie beside")],
+    [
+        ('"format": 2', '"format": 1', "reads records of format 2"),
+        ('"trajectory.npz"', '"../../../secret.npz"', "must be in the folder of their record"),
+    ],
 )
 def test_a_record_of_another_format_or_of_a_file_elsewhere_is_not_followed(scenario, tmp_path, old, new, note):
     (tmp_path / "secret.npz").write_bytes(b"secret")
@@ -63,7 +66,7 @@ def test_a_link_out_of_the_folder_is_not_followed(scenario, tmp_path):
     twin.rename(outside)
     twin.symlink_to(outside)
     run = find([scenario]).runs[1]
-    assert "twin" not in run.paths and "must lie inside" in run.notes[0]
+    assert "twin" not in run.paths and "must be inside" in run.notes[0]
 
 
 def test_a_header_that_promises_more_than_the_file_and_a_pickle_are_refused_before_memory_is_taken(scenario):
@@ -76,7 +79,7 @@ def test_a_header_that_promises_more_than_the_file_and_a_pickle_are_refused_befo
         for name, content in members.items():
             archive.writestr(name, header.getvalue() if name == "material.stiffness.npy" else content)
     record(path.parent)
-    with pytest.raises(InputError, match=r"header of material\.stiffness must agree"):
+    with pytest.raises(InputError, match=r"header of material\.stiffness must match"):
         _ = find([scenario]).runs[0].twin
     np.savez(path, meta=np.array([{"kind": "twin"}], dtype=object))
     record(path.parent)
@@ -94,6 +97,6 @@ def test_a_capture_of_ones_own_is_found_where_its_record_says(scenario, tmp_path
     assert found.capture.folder == own.folder and not found.notes
     spoil(own.folder / CAPTURE, '"name": ', ' "name": ')
     assert find([scenario]).capture is None
-    assert "must be the capture of this run; received one that was changed since" in find([scenario]).notes[0]
+    assert "must be the capture of this run; received a changed capture" in find([scenario]).notes[0]
     (own.folder / CAPTURE).unlink()
     assert "no cameras: " in find([scenario]).notes[0]

@@ -1,4 +1,4 @@
-"""The tables beside the paper's: its conventions, honest verdicts, nothing hidden."""
+"""Study tables with the paper's values and ours: the paper's conventions, honest verdicts, nothing hidden."""
 
 import re
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ def test_the_papers_values_keep_their_digits_in_mm():
         ({"baseline": "Nobody"}, "baseline: must be a label"),
         ({"reference": "table9"}, "reference: must be null or one of table1_comparison"),
         ({"rows": {"a": "x", "b": "x"}, "baseline": "a", "reference": None}, "methods must differ"),
-        ({"rows": {"w/o TP": "x", "NeuSprint": "y"}, "baseline": "w/o TP"}, "also has"),
+        ({"rows": {"w/o TP": "x", "NeuSprint": "y"}, "baseline": "w/o TP"}, "must contain every label"),
         ({"beside": "table2"}, "beside: unknown key"),
     ],
 )
@@ -76,7 +76,7 @@ def test_a_wrong_study_is_refused(change, field, tmp_path):
     with pytest.raises(InputError, match=re.escape(field)):
         parse(Study, good | change, "here")
     (tmp_path / "s.yaml").write_text("summary: {title: T, reference: null, baseline: a, rows: {a: x}}\n")
-    with pytest.raises(InputError, match=r"summary.*are taken"):
+    with pytest.raises(InputError, match=r"study summary.*must not be"):
         read_studies(tmp_path / "s.yaml")
 
 
@@ -148,7 +148,7 @@ def test_an_oracle_in_a_study_is_never_marked():
     values = {(f"s{k}", m, 0): v for k in range(6) for m, v in (("x", 0.01), ("y", 0.008), ("oracle", 0.001))}
     table = made(values)
     table = ScoreTable(table.rows, table.runs.assign(oracle=table.runs["method"] == "oracle"))
-    rows = tables_in(blocks_of("s", study, table, Path()))["Ours"].rows
+    rows = tables_in(blocks_of("s", study, table, Path()))["Our values"].rows
     assert [row[0].text for row in rows if any(cell.mark for cell in row)] == ["y"] and len(rows) == 3
 
 
@@ -173,7 +173,7 @@ def written(tmp_path_factory):
 def test_failures_absent_methods_and_settings_are_named(written):
     _, _, text = written
     assert "| 13/14 (1 failed) | ours" in text
-    assert "12 of 16 pairs of scenario and seed count" in text and "Not among these runs: Spring-Gaus (spring_gaus)" in text
+    assert "the 12 of 16 pairs of scenario and seed" in text and "Without runs: Spring-Gaus (spring_gaus)" in text
     assert f"| NeuSpring | failed         | {RELEASED[0]}/1" in text and "node 3 left \\| the scene" in text
     assert f"| PhysTwin  | failed         | {RELEASED[1]}/0" in text and "damaged record: " in text
     assert f"| NeuSpring | does not apply | {RELEASED[7]}" in text
@@ -182,7 +182,7 @@ def test_failures_absent_methods_and_settings_are_named(written):
 
 def test_the_best_is_marked(written):
     folder, table, _ = written
-    main = tables_in(blocks_of("table1", STUDIES["table1"], table, folder))["Ours beside the paper's"]
+    main = tables_in(blocks_of("table1", STUDIES["table1"], table, folder))["The paper's values and ours"]
     ours = {row[0].text: row[3].mark for row in main.rows if row[2].text == "ours"}
     assert ours == {"Spring-Gaus": "", "GS-Dynamics": "", "PhysTwin": "", "NeuSpring": "best"}
     latex = (folder / "studies" / "table1.tex").read_text()
@@ -198,7 +198,7 @@ def test_a_metric_of_ours_is_shown_beside_the_papers_columns():
     factors, bound = {"baseline": 1.0, "model_a": 0.7}, ("future", "track_error_bound")
     values = {(f"s{k}", m, 0): {TE: 0.02 * f, bound: 0.01 * f} for k in range(6) for m, f in factors.items()}
     blocks = tables_in(blocks_of("table2", STUDIES["table2"], made(values, source="mocap"), Path()))
-    changes = blocks["Change against Baseline"]
+    changes = blocks["Compared with Baseline"]
     rows = [dict(zip(changes.header, row, strict=True)) for row in changes.rows if row[0].text == "Model-A (PT)"]
     assert [row["Future TE bound ↓"].text for row in rows] == ["–", "0.700 [0.700, 0.700]"]
-    assert "Future TE bound ↓" in rows_of(blocks["Ours beside the paper's"])["Baseline"]
+    assert "Future TE bound ↓" in rows_of(blocks["The paper's values and ours"])["Baseline"]

@@ -48,17 +48,20 @@ def test_the_verdict_says_who_is_ahead_by_how_much_and_whether_it_is_resolved(fa
     values = {(f"s{i}", m, 0): 0.02 * f for i, factor in enumerate(factors) for m, f in (("ours", factor), ("base", 1.0))}
     lead, table = verdict(benchmark(values))[:2]
     mean = np.exp(np.log(factors).mean())
-    assert lead.text.startswith(f"{ahead} is ahead.") and f"{mean:.3f}" in lead.text and lead.text.endswith(f": {resolved}.")
+    assert lead.text.startswith(f"{ahead} is ahead") and f"{mean:.3f}" in lead.text and ". " not in lead.text
+    assert (f"({resolved})" in lead.text) == (ahead == "No method")
     row = rows_of(table)["ours"]
-    assert row["Resolved"].text == resolved and row["Ratio [95 %]"].text in lead.text
+    assert row["Verdict"].text == resolved and row["Ratio [95 %]"].text in lead.text
+    assert (row["Error"].text, row["Rival's error"].text) == (f"{20 * np.mean(factors):.2f}", "20.00")
+    assert [rows_of(table)["base"][name].text for name in ("Rival", "Rival's error", "Better in")] == ["", "–", ""]
     assert row["Better in"].text == f"{sum(f < 1 for f in factors)} of {len(factors)}"
-    assert row["Worst scenario"].text.startswith(f"s{int(np.argmax(factors))} (")
+    assert row["Worst scenario (error)"].text.startswith(f"s{int(np.argmax(factors))} (")
 
 
 def test_nobody_wins_alone_or_before_anything_has_finished():
-    assert "ours is alone" in verdict(benchmark({("a", "ours", 0): 0.01}))[0].text
+    assert "Only ours has results" in verdict(benchmark({("a", "ours", 0): 0.01}))[0].text
     (only,) = verdict(benchmark({}, failed=[("a", "ours", 0)]))
-    assert only.text == "Nothing can be compared yet: 0 of 1 runs have finished."
+    assert only.text == "No comparison is possible yet: 0 of 1 runs have finished."
 
 
 def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
@@ -72,7 +75,7 @@ def test_averages_mark_the_best_count_runs_and_keep_oracles_apart():
         "y": ("8.00", "best", "1/2 (1 failed)"),
         "o (oracle)": ("1.00", "", "1/1"),
     }
-    assert "Averages take the 1 of 2 pairs" in markdown(summary_blocks(numbers))
+    assert "Averages use the 1 of 2 pairs" in markdown(summary_blocks(numbers))
     assert {row["Method"].text for row in rows_of(failure_blocks(numbers)[-1]).values()} == {"y", "z"}
 
 
@@ -84,7 +87,7 @@ def test_the_direction_of_a_metric_decides_what_is_best_and_only_errors_have_rat
     for caption in ("Errors, mm", "Per scenario"):
         assert {name for name, row in rows_of(found[caption]).items() if row[heading].mark} <= {*marked, *"abc"}
     assert [name for name, row in rows_of(found["Errors, mm"]).items() if row[heading].mark] == marked
-    (change,) = rows_of(found["Change against x"]).values()
+    (change,) = rows_of(found["Compared with x"]).values()
     assert change[heading].text.startswith("-2.00 [") and not change[heading].tone
 
 
@@ -97,10 +100,10 @@ def test_changes_breakdowns_and_pictures_have_tables():
     numbers = benchmark(values, baseline="x", images=json.dumps(facts))
     found = tables_in(summary_blocks(numbers))
     assert rows_of(found["Errors, mm"])["y"]["Future TE ↓"].text == "13.50 ± 6.36"
-    changes = rows_of(found["Change against x"])["y"]
+    changes = rows_of(found["Compared with x"])["y"]
     assert changes["Future TE ↓"].text == "0.900 [0.900, 0.900]: below 1"
     assert changes["Future PSNR ↑"].text == "-0.100 [-0.100, -0.100]"
-    assert "lpips: no AlexNet weights" in found["Scores of pictures"].note
+    assert "lpips: no AlexNet weights" in found["Image scores"].note
     assert len(found["Per scenario"].rows) == 12 and found["Per scenario"].rows[1][2].mark == "best"
 
 
@@ -128,7 +131,7 @@ def test_failures_and_settings_are_listed(tmp_path):
     )
     table = collect(tmp_path, ["a", "b"], ["x", "y"], [0], {"x": {"b": "needs images"}})
     text = write(Compared(table=table, baseline="x"), tmp_path / "tables")
-    assert "| y      | all, failed held | 60.00" in text
+    assert "| y      | successful and failed runs | 60.00" in text
     assert "rollout: node 3 \\| left" in text and "| x      | does not apply | b " in text
     assert "| fit.horizon | 1: x; 9: y" in text
     assert (tmp_path / "tables" / "summary.md").read_text().startswith("# Scores\n")
@@ -142,9 +145,9 @@ def test_failures_and_settings_are_listed(tmp_path):
     [
         (["tables", "--left-out", '{"x": "a"}'], "--left-out"),
         (["tables", "--left-out", "{"], "--left-out"),
-        (["tables"], "with runs is required"),
+        (["tables"], "must contain runs"),
         (["explain", "nobody"], "scores.csv"),
-        (["study", "--study", "nothing"], "must be a row of"),
+        (["study", "--study", "nothing"], "must be an entry of"),
     ],
 )
 def test_what_cannot_be_laid_out_is_refused(tmp_path, arguments, words, capsys):
@@ -159,13 +162,16 @@ def test_commands_make_tables_studies_and_explanations(tmp_path, capsys):
             write_run(tmp_path, f"cable_{number}", method, 0, {FUTURE: 0.01 * factor * (1 + number)}, source="mocap")
     tables = tmp_path / "tables"
     assert main(["tables", "--results", str(tmp_path), "--output", str(tables), "--baseline", "baseline", "--brief"]) == 0
-    assert "NeuSpring (`neuspring`) is ahead." in capsys.readouterr().out
+    assert (
+        "NeuSpring (`neuspring`) is ahead: the track error on future frames of NeuSpring (`neuspring`) is 0.800 ["
+        in capsys.readouterr().out
+    )
     assert main(["study", "--study", "table1", "--results", str(tmp_path), "--output", str(tables / "studies")]) == 0
     assert main(["study", "--study", "table1", "--scores", str(tables / "scores.csv"), "--output", str(tmp_path / "other")]) == 0
     assert (tables / "studies" / "table1.csv").read_text() == (tmp_path / "other" / "table1.csv").read_text()
     assert main(["explain", "neuspring/future/TE", "--results", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "6 rows behind neuspring/future/TE" in out and f"{tmp_path}/cable_5/neuspring/0/run.json" in out
+    assert "Rows of scores.csv: 6 match neuspring/future/TE" in out and f"{tmp_path}/cable_5/neuspring/0/run.json" in out
     assert main(["explain", "neuspring/pst", "--results", str(tmp_path)]) == 2
     assert "method: neuspring |" in capsys.readouterr().err
 
@@ -173,7 +179,7 @@ def test_commands_make_tables_studies_and_explanations(tmp_path, capsys):
 def test_findings_of_runs_name_the_next_move():
     params = {"search.result.at_ends": "drag", "fit.result.best_epoch": -1, "fit.result.springs": 9, "fit.result.object_springs": 9}
     found = of_runs([run_record(scenario="b", method="ours", params=params), run_record(scenario="c", method="ours")])
-    assert {one.name: one.remedy for _, one in found} == {
+    assert {finding.name: finding.remedy for _, finding in found} == {
         "search at an end of its range": "Widen search.variables for drag.",
         "training improved nothing": "Lower fit.learning_rate.",
         "no spring joins a controller to the object": "Look at the controllers in lifted.png.",

@@ -150,10 +150,10 @@ def damage(kind: str, path: Path, values: dict[str, torch.Tensor], whole: bytes)
     name = next(key for key in values if key.endswith("weight") and key.startswith(("features", "lin")))
     if kind == "truncated":
         path.write_bytes(whole[: len(whole) // 2])
-        return "must hold weights"
+        return "must contain weights"
     if kind == "code":
         torch.save({name: importlib.util.find_spec}, path)
-        return "must hold weights"
+        return "must contain weights"
     changed = {
         "shape": values | {name: values[name][:, :1]},
         "nan": values | {name: values[name] * float("nan")},

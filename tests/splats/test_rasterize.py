@@ -160,7 +160,7 @@ def test_pictures_and_gradients_are_handed_on(stand_in, degree):
 
 def test_thresholds_that_gsplat_would_not_keep_are_refused(stand_in):
     splats = random_splats(0, 4, torch.float32)
-    with pytest.raises(InputError, match="gsplat keeps its own thresholds"):
+    with pytest.raises(InputError, match="gsplat has fixed thresholds"):
         rasterize(*splats, small_view(), limits=Limits(alpha_max=0.9), backend="gsplat")
 
 

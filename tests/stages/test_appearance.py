@@ -201,10 +201,10 @@ def test_masks_of_another_size_and_empty_ones_are_named(scene, tmp_path, capsys)
         made.learn(short)
     made.masks = with_masks(scene, tmp_path / "empty", np.zeros((FRAMES, SIZE[1], SIZE[0]), np.uint8))
     record = made.learn(short)
-    assert "camera 0: the object is not in view in frame 0" in capsys.readouterr().out
+    assert "camera 0: the object is not visible in frame 0" in capsys.readouterr().out
     assert record.facts["cameras"] == ["1", "2"]
     made.masks = made.masks[:1] * 3
-    with pytest.raises(InputError, match="at least one camera must have the object in view"):
+    with pytest.raises(InputError, match="at least one camera must show the object"):
         made.learn(short)
 
 

@@ -120,7 +120,7 @@ def test_a_camera_without_object_and_hand_in_frame_0_is_not_used(tmp_path, capsy
     capture = film(tmp_path / "capture", cameras=2)
     cv2.imwrite(str(capture.path("mask", "1", 0)), np.zeros(SIZE[::-1], np.uint8))
     observations = perceived(capture, tmp_path)
-    assert "camera 1: neither object nor hands in frame 0; it is not used" in capsys.readouterr().out
+    assert "camera 1: neither object nor hands are visible in frame 0" in capsys.readouterr().out
     assert np.median(motion_error(observations)) < 0.003
 
 
@@ -128,5 +128,5 @@ def test_too_few_controllers_say_what_to_change(tmp_path, whole):
     _, _, folder = whole
     settings = replace(SETTINGS, perception=replace(SETTINGS.perception, lift=Lift(neighborhood=0.02, least_controllers=3000)))
     records = {name: [folder / camera / f"{name}.json" for camera in "012"] for name in ("masks", "tracks")}
-    with pytest.raises(InputError, match=r"at least 3000 points of the hands.*perception\.lift has controller_gaps"):
+    with pytest.raises(InputError, match=r"at least 3000 points of the hands.*controller_gaps"):
         lift(capture=whole[0].folder / "capture.json", settings=settings, output=tmp_path / "lifted.json", **records)

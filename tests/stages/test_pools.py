@@ -59,5 +59,5 @@ def test_a_search_on_another_pool_starts_afresh(seen, tmp_path, capsys):
     assert "made with other inputs or settings" in capsys.readouterr().out
     first = pd.read_parquet(tmp_path / "trace.parquet")
     search(**given, pool=[seen["shake"]])
-    assert "continuing the search after 6 rollouts" in capsys.readouterr().out
+    assert "resuming the search after 6 rollouts" in capsys.readouterr().out
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "trace.parquet"), first)

@@ -210,7 +210,7 @@ def test_a_missing_or_changed_artifact_is_an_error_that_says_what_to_do(finished
     _, run, _ = finished
     record = tmp_path / "fit.json"
     record.write_bytes(run.with_name("fit.json").read_bytes())
-    with pytest.raises(InputError, match=r"twin.npz: named by .*no such file.*Delete .*fit.json and run again"):
+    with pytest.raises(InputError, match=r"twin.npz: this file of .*no such file.*Delete .*fit.json and rerun the command"):
         StageRecord.load(record).file("twin", record)
     twin.write_bytes(b"other")
     with pytest.raises(InputError, match="other content"):

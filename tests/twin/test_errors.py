@@ -43,13 +43,13 @@ def on_a_node():
         (
             lambda: search(small.search_problem(simulation=config.SimulationSettings(safety=1e-6)), seed=0),
             NumericalFailure,
-            r"none of 22 candidates.*needs \d+ substeps",
+            r"none of 22 candidates.*requires \d+ substeps",
         ),
         (on_a_node, InputError, "topology: a controller may not coincide"),
         (lambda: graphs.uniform_topology(NODES, NODES[1:], 0.5, 5, 0.5, 5), InputError, r"topology: .*spring \[2, 1\]"),
         (lambda: graphs.regions(NODES, 5), InputError, "clusters: .*received 2 nodes"),
         (lambda: graphs.regions(NODES, 0), InputError, "clusters"),
-        (lambda: graphs.node_spacing(np.ones((3, 3))), InputError, ".*two nodes at different places"),
+        (lambda: graphs.node_spacing(np.ones((3, 3))), InputError, ".*two nodes at different positions"),
     ],
 )
 def test_what_is_refused_is_named(call, error, field):

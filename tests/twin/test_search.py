@@ -422,7 +422,7 @@ def test_a_cost_that_is_no_number_is_penalized_and_never_the_best(monkeypatch, f
 
     monkeypatch.setattr(module, "rolled", spoiled)
     result = search(small.search_problem(search=small.released(rollouts=12)), seed=0)
-    named = result.trace["reason"] == "its cost is not a number"
+    named = result.trace["reason"] == "the cost is not a number"
     assert named.sum() == 3 and (result.trace["cost"][named] == PENALTY).all()
     assert result.cost == result.trace["cost"][~named].min() < PENALTY
 

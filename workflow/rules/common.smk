@@ -1,4 +1,4 @@
-# Checks the configuration before any job exists, and defines the helper functions of the rules.
+# Check the configuration before any job exists, and define the functions of the rules.
 import functools
 import json
 import os
@@ -20,8 +20,8 @@ except ModuleNotFoundError:
     SWEEPS = None
 
 ROOT = Path(workflow.basedir)
-# On a cluster the scheduler hands out GPUs, and Snakemake limits jobs (--jobs), not cores. A dry run sets cores to 1; inside a job of
-# the cluster neither is set. Which executor was asked for is not known yet.
+# On a cluster, the scheduler assigns GPUs and Snakemake limits jobs (--jobs), not cores. The chosen executor is not known yet, so
+# these settings reveal a cluster. A dry run sets cores to 1; inside a job of the cluster neither is set.
 CLUSTER = workflow.remote_exec or (
     workflow.resource_settings.nodes is not None
     and (workflow.resource_settings.cores is None or workflow.output_settings.dryrun)
@@ -30,7 +30,7 @@ BEGUN = time.time()
 
 
 def or_workflow_error(check, *arguments, **named):
-    """What a check returns; a clear message and no traceback where it refuses."""
+    """Call a check; its InputError becomes a message without a traceback."""
     try:
         return check(*arguments, **named)
     except InputError as error:
@@ -51,25 +51,25 @@ POOL = (
     else or_workflow_error(gpus.pool_of, CONFIG.gpus, CONFIG.device, plan_only=DRY)
 )
 if not CLUSTER:
-    # Without a limit Snakemake would run jobs at once that then wait for a GPU.
+    # Without a limit, Snakemake would start jobs that only wait for a GPU.
     limit = workflow.global_resources.get("gpu")
     slots = or_workflow_error(
         gpus.slots_of, POOL, CONFIG.gpus.jobs_per_gpu, limit and limit.value
     )
     if slots:
         workflow.register_resource("gpu", slots)
-# Jobs inherit it. A cluster chooses the devices of its jobs.
+# Jobs inherit this variable. A cluster assigns the devices of its jobs.
 os.environ[job.POOL] = job.GIVEN if CLUSTER else ",".join(POOL)
 
 
 @functools.cache
 def jobs():
-    """The jobs of this configuration. A target that is a study chooses methods; targets are known once all rules are read."""
+    """The jobs of this configuration. Targets that are studies select methods; targets are known only after all rules are read."""
     chosen = for_targets(config, workflow.dag_settings.targets, ROOT)
     benchmark = BENCHMARK
     if chosen:
         config.update(chosen)
-        # Jobs of a cluster are not told the targets.
+        # Jobs of a cluster do not receive the targets, only the configuration.
         words = [
             f"{key}={value if key == 'only' else json.dumps(value)}"
             for key, value in chosen.items()
@@ -87,7 +87,7 @@ def unit_of(rule, wildcards):
 
 
 def records(units):
-    """The records that say that units are finished, which are the outputs of their jobs."""
+    """The records of the jobs that make these units, which are the outputs of the rules."""
     graph = jobs()[0]
     return [str(graph.record(graph.job_of(unit))) for unit in units]
 
@@ -98,7 +98,7 @@ def needs_of(rule):
 
 
 def target(choose):
-    """The input function of a target: tells the plan, and asks for the units that `choose(graph, tasks)` names."""
+    """The input function of a target: print the plan, and request the units that `choose(graph, tasks)` returns."""
 
     def chosen(wildcards):
         graph, tasks = jobs()
@@ -120,34 +120,38 @@ def tell_plan():
     files = workflow.config_settings.configfiles
     where = {"gpus": POOL, "cores": cores, "cluster": CLUSTER}
     todo = graph.todo(RUN.get("targets", []))
-    print(plan.told(graph, todo, files, **where), end="", flush=True)
+    print(plan.summary(graph, todo, files, **where), end="", flush=True)
 
 
 def priority_of(rule):
-    """A job's priority."""
+    """The priority function of a rule: GPU jobs first, then jobs of earlier scenarios."""
 
-    def found(wildcards):
+    def priority(wildcards):
         graph, unit = jobs()[0], unit_of(rule, wildcards)
         return 10 * graph.gpus(unit) + graph.earliness(unit)
 
-    return found
+    return priority
 
 
 def needed_by(rule):
-    """Memory, time and GPUs of a rule's jobs: those that the stages of a job declare, more at every attempt."""
+    """Memory, time and GPUs of a rule's jobs, from the declarations of their stages; every attempt requests more."""
 
     def stages(wildcards):
-        # Members of a batch share launches: they take the time and the memory of one.
+        # Members of a batch share launches, so the batch requests the time and memory of one member.
         unit = unit_of(rule, wildcards)
         return [step.stage for step in (unit.members or (unit,))[0].steps]
 
     def memory(wildcards, attempt):
-        return attempt * max((one.memory_mb for one in stages(wildcards)), default=4000)
+        return attempt * max(
+            (stage.memory_mb for stage in stages(wildcards)), default=4000
+        )
 
     def minutes(wildcards, attempt):
-        return attempt * (sum(one.minutes for one in stages(wildcards)) or RULES[rule])
+        return attempt * (
+            sum(stage.minutes for stage in stages(wildcards)) or RULES[rule]
+        )
 
     resources = {"mem_mb": memory, "runtime": minutes}
-    if any(one.gpu for one in STAGES_OF.get(rule, [])) or "tune" == rule:
+    if any(stage.gpu for stage in STAGES_OF.get(rule, [])) or "tune" == rule:
         resources["gpu"] = lambda wildcards: jobs()[0].gpus(unit_of(rule, wildcards))
     return resources

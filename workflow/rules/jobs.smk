@@ -1,6 +1,6 @@
-# One rule per kind of job. What a job runs and reads follows from declarations of stages: neuspring/experiments/graph.py. The name of
-# its record has the digest of its settings, code and inputs, so that Snakemake finds what is finished by the file alone: results may
-# be copied or moved.
+# One rule per kind of job. neuspring/experiments/graph.py derives steps and inputs of a job from the declarations of stages. The
+# name of its record contains the digest of settings, code and inputs, so Snakemake recognizes finished jobs by file name, also
+# after results were copied or moved.
 STAGES_OF = Graph(BENCHMARK).rules
 
 for RULE in (*STAGES_OF, *(name for name in RULES if name not in STAGES_OF)):
@@ -18,9 +18,9 @@ for RULE in (*STAGES_OF, *(name for name in RULES if name not in STAGES_OF)):
             f"{RESULTS}/{FOLDER}/{RULE}/{{job}}/{{digest}}.tsv"
         wildcard_constraints:
             digest="[0-9a-f]{16}",
-        # GPU jobs first, so that CPU jobs cannot starve a GPU; then those of earlier scenarios.
+        # GPU jobs get priority, so CPU jobs cannot starve a GPU; then jobs of earlier scenarios.
         priority: priority_of(RULE)
-        # On a cluster it is the main process that tries again: inside a submitted job retries would multiply.
+        # On a cluster only the main process retries, because retries inside submitted jobs would multiply.
         retries: 0 if workflow.remote_exec else 1
         conda:
             str(ROOT / "workflow" / "envs" / "neuspring.yaml")

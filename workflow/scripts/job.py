@@ -1,4 +1,4 @@
-"""One job of any rule. Snakemake provides `snakemake`; the configuration is the one that the workflow was planned with."""
+"""Run one job of any rule. Snakemake provides `snakemake` with the configuration of the plan."""
 
 from pathlib import Path
 

@@ -1,11 +1,10 @@
-"""The MLflow index of the run records. Files are the record; this index can be deleted and rebuilt from them (`sync`).
+"""The MLflow index of the run records. It can be deleted and rebuilt from the records (`sync`).
 
-Only the tracking modules import mlflow, and only when it is used. An MLflow, network or database error never fails a run: it
-becomes the outcome `unreachable: <reason>` and a warning, and `sync` logs the run later.
+mlflow is imported only on use. An MLflow, network or database error never fails a run: it becomes the outcome
+`unreachable: <reason>` with a warning, and `sync` logs the run later.
 
-A run in MLflow is complete when it carries the tag `logged = complete`, which is set after everything else was sent. A run
-without that tag was left behind by a killed logger, if nobody holds the lock of its record (`<results>/.locks/<run key>.lock`); it
-is deleted when the record is logged.
+A run in MLflow is complete if it has the tag `logged = complete`, which is set last. A run without this tag whose record is not
+locked (`<results>/.locks/<run key>.lock`) was left by a killed logger; it is deleted when the record is logged.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ if TYPE_CHECKING:
     from mlflow.entities import Metric
 
 MOST_PARAMS, TAG_LENGTH = 60, 5000
-"""These keep MLflow's tables readable. All is in run.json."""
+"""Limits that keep MLflow's tables readable; run.json contains everything."""
 OUTCOME = "mlflow.txt"
-"""The outcome of logging a record, beside it; the workflow's job writes it."""
+"""File with the outcome of logging a record, in the record's folder; the workflow's job writes it."""
 
 
 def init(results: Path, settings: Tracking) -> dict[str, str]:
-    """Create the database and the experiment. Run it once, before jobs that log; again does no harm.
+    """Create the database and the experiment if they do not exist.
 
-    Returns `outcome` ("ready", "disabled" or "unreachable: <reason>") with `uri`, `experiment` and, when ready, `experiment_id`.
+    Returns `outcome` ("ready", "disabled" or "unreachable: <reason>") with `uri`, `experiment` and, if ready, `experiment_id`.
     """
     facts = {"uri": masked(settings.uri or default_uri(results)), "experiment": settings.experiment}
     if not settings.enabled:
@@ -45,42 +44,41 @@ def init(results: Path, settings: Tracking) -> dict[str, str]:
     try:
         _, experiment = connect(results, settings)
     except Exception as error:
-        return {"outcome": _unreachable(error, results, settings, "no run will be logged until `init` succeeds"), **facts}
+        return {"outcome": _unreachable(error, results, settings, "no run is logged until `init` succeeds"), **facts}
     return {"outcome": "ready", **facts, "experiment_id": experiment}
 
 
 def log_run(run_json: Path, results: Path, settings: Tracking) -> str:
     """Log one run record; logging it again changes nothing.
 
-    The same results made again, by another commit or later, are the same run.
-    Returns "logged", "already logged", "disabled" or "unreachable: <reason>". Raises InputError for a damaged record or a file
-    that it names and that is missing or damaged; nothing else.
+    Equal results, made later or by another commit, are the same run. Returns "logged", "already logged", "disabled" or
+    "unreachable: <reason>". Raises only InputError, for a damaged record and for a missing or damaged file of the record.
     """
     if not settings.enabled:
         return "disabled"
     run_json, results = Path(run_json), Path(results)
     record = RunRecord.load(run_json)
     try:
-        # Locked to the end, not only while the run is created: the lock tells a live logger from a killed one.
+        # The lock is held to the end, because it distinguishes a running logger from a killed one.
         with lock(results, record.run_key):
             return _log(*connect(results, settings), record, run_json)
     except InputError:
         raise
     except Exception as error:
-        return _unreachable(error, results, settings, f"{record.name} is not logged; its files are complete, `sync` will log it")
+        return _unreachable(error, results, settings, f"{record.name} is not logged; its files are complete, and `sync` logs it")
 
 
 def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = lambda line: None) -> dict[str, list[str]]:
-    """Log every run.json under `results` that MLflow lacks; an empty database is rebuilt like this.
+    """Log every run.json in `results` that MLflow does not contain; this also rebuilds an empty database.
 
-    An mlflow.txt beside a record that says "unreachable" is corrected. `progress` receives one line per run. Returns the run names
-    by outcome: those of `log_run`, and "damaged" (details on stderr).
+    An mlflow.txt with "unreachable" is corrected. `progress` receives one line per run. Returns the run names by outcome: the
+    outcomes of `log_run`, and "damaged" (details on stderr).
     """
     results = Path(results).resolve()
     outcomes: dict[str, list[str]] = {}
-    # A server that is down must not cost its timeout once per run.
+    # `init` runs once, so that an unreachable server costs one timeout and not one per run.
     first = init(results, settings)["outcome"]
-    # The copies among MLflow's artifacts lie deeper.
+    # MLflow's artifacts contain copies at deeper levels, which the pattern excludes.
     for path in sorted(results.glob(f"*/*/*/{RUN_RECORD}")):
         name = path.parent.relative_to(results).as_posix()
         try:
@@ -97,7 +95,7 @@ def sync(results: Path, settings: Tracking, progress: Callable[[str], object] = 
 
 
 def _unreachable(error: Exception, results: Path, settings: Tracking, consequence: str) -> str:
-    """The outcome of an error of MLflow, told as a warning with its consequence."""
+    """The outcome for an error of MLflow; prints it as a warning with its consequence."""
     outcome = f"unreachable: {explained(error, results, settings)}"
     _warn(f"{outcome}; {consequence}.")
     return outcome
@@ -107,14 +105,14 @@ def _warn(message: str) -> None:
     print(f"warning: tracking: {message}", file=sys.stderr)
 
 
-# --- what is sent for a run: its record and the files that it names, read and checked before anything is sent ---
+# --- content of a run: its record and the files that it names, all read and checked before anything is sent ---
 
 
 def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Path) -> str:
     """Log a record whose lock the caller holds."""
     from mlflow.entities import Param
 
-    # A killed logger may have ended its run and died before the last tag. Then the run is FINISHED, but not complete.
+    # A killed logger may have left a FINISHED run without the last tag, which is incomplete.
     runs = client.search_runs([experiment], f"tags.run_key = '{record.run_key}'")
     complete = [run for run in runs if run.data.tags.get("logged") == "complete"]
     for run in runs:
@@ -138,22 +136,22 @@ def _log(client: MlflowClient, experiment: str, record: RunRecord, run_json: Pat
 
 
 def params_of(record: RunRecord) -> dict[str, Any]:
-    """The settings that tell runs apart, named as in the configuration: the method's switches, and what has not its default value.
+    """The settings that distinguish runs: the method's own settings and non-default values, with the names of the configuration.
 
-    `settings` is a digest of all, so that a comparison sees also what is not listed. In full they are in run.json.
+    `settings` is a digest of all settings, so a comparison also shows differences that are not listed; run.json contains all.
     """
     defaults = flat(plain(Config()))
     given = {name: value for name, value in record.params.items() if ".result." not in name}
-    found = dict(record.variant)
+    params = dict(record.variant)
     for name, value in given.items():
         stage, _, key = name.partition(".")
         if stage != "method" and (key not in defaults or defaults[key] != value):
-            found.setdefault(key if "." in key else name, value)
-    return {"settings": key_of(given)[:16], **dict(list(found.items())[: MOST_PARAMS - 1])}
+            params.setdefault(key if "." in key else name, value)
+    return {"settings": key_of(given)[:16], **dict(list(params.items())[: MOST_PARAMS - 1])}
 
 
 def milliseconds(time: str) -> int:
-    """ms since 1970, as MLflow counts, of an ISO 8601 time with a zone."""
+    """MLflow's time, ms since 1970, of an ISO 8601 time with a time zone."""
     return round(datetime.fromisoformat(time).timestamp() * 1000)
 
 
@@ -162,17 +160,17 @@ def _tags(record: RunRecord, folder: Path) -> dict[str, str]:
     tags = {name: str(getattr(record, name)) for name in (*names, "run_key")}
     tags |= {f"variant.{name}": str(value) for name, value in record.variant.items()}
     if record.commit:
-        tags["mlflow.source.git.commit"] = record.commit  # MLflow's pages show this one as the version
-    # How to look at the run and pull its twin: as a tag, and in the description on MLflow's page.
+        tags["mlflow.source.git.commit"] = record.commit  # MLflow's pages show this tag as the version
+    # The command that opens the twin is a tag, and part of the description on MLflow's page.
     tags["play"] = command = shlex.join(["neuspring", "play", str(folder)])
-    tags["mlflow.note.content"] = f"To turn this run's twin in the browser, and pull it:\n\n```\n{command}\n```\n"
+    tags["mlflow.note.content"] = f"Rotate and pull this run's twin in the browser:\n\n```\n{command}\n```\n"
     return {name: value[:TAG_LENGTH] for name, value in tags.items()}
 
 
 def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
     """Scores as `scores/{task}.{metric}`, histories as `training/{history}.{metric}` by step, timings and memory as `usage/...`.
 
-    MLflow's pages of curves have a section for each word before `/`, in the order of the alphabet, and what has none comes last.
+    MLflow's pages of curves have one section per word before `/`, in alphabetical order; metrics without `/` come last.
     """
     from mlflow.entities import Metric
 
@@ -190,7 +188,7 @@ def _metrics(record: RunRecord, run_json: Path) -> Iterator[Metric]:
 
 
 def _table(run_json: Path, name: str, by: str, *more: str) -> list[tuple[Any, ...]]:
-    """(`by`, metric, value, and `more`) of each row of a Parquet file beside a record. Raises InputError."""
+    """(`by`, metric, value, and `more`) for each row of a Parquet file in a record's folder. Raises InputError."""
     import pandas
 
     path, columns = _require_file(run_json, run_json.parent / name), [by, "metric", "value", *more]
@@ -200,11 +198,11 @@ def _table(run_json: Path, name: str, by: str, *more: str) -> list[tuple[Any, ..
     except (OSError, ValueError, TypeError, KeyError) as error:
         rule = f"must be a Parquet table with the columns {', '.join(columns)}"
         reason = f"{type(error).__name__}: {error}".partition("\n")[0][:300]
-        raise InputError(path, rule, reason, f"Delete {run_json} and run again.") from error
+        raise InputError(path, rule, reason, f"Delete {run_json} and rerun the command.") from error
     return list(table.itertuples(index=False, name=None))
 
 
 def _require_file(run_json: Path, path: Path) -> Path:
     if not path.is_file():
-        raise InputError(path, f"named by {run_json}", "no such file", f"Delete {run_json} and run again.")
+        raise InputError(path, f"this file of {run_json} must exist", "no such file", f"Delete {run_json} and rerun the command.")
     return path

@@ -1,6 +1,6 @@
-"""The MLflow store: where it is, how it is created, and the locks that tell loggers apart.
+"""The MLflow store: its location, its creation, and the locks that distinguish running loggers from killed ones.
 
-mlflow is imported only when it is used, after its environment is set.
+mlflow is imported only on use, after its environment variables are set.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ ENVIRONMENT = {
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
     "PGCONNECT_TIMEOUT": "10",
 }
-"""Set before mlflow is imported, where the user has not set them: no telemetry; no tracebacks beside our own one-line warnings;
-and a server that is away costs seconds. With MLflow's own defaults (7 retries of 120 s) it would cost minutes."""
+"""Environment variables that are set before mlflow is imported, unless the user has set them: no telemetry, no tracebacks, and
+short timeouts. MLflow's defaults (7 retries of 120 s) wait minutes for an unreachable server."""
 DATABASE_RETRIES = 2
-"""In place of MLflow's ten, which take two minutes where nobody is at the address."""
+"""Number of connection attempts. MLflow's default of ten takes two minutes for an unreachable database."""
 ARTIFACTS, INDEX = "mlartifacts", "mlflow.db"
 REASONS = {
     "disk is full": "no space left on the disk of {results}; free some, then run `neuspring sync`",
@@ -42,26 +42,26 @@ REASONS = {
     "readonly database": "{results} cannot be written; make it writable, then run `neuspring sync`",
     "read-only file system": "{results} cannot be written; make it writable, then run `neuspring sync`",
     "permission denied": "{results} cannot be written; make it writable, then run `neuspring sync`",
-    "database is locked": "another program keeps the index of {results} locked; close it, then run `neuspring sync`",
+    "database is locked": "another program locks the index of {results}; close it, then run `neuspring sync`",
 }
-"""Part of an error of SQLite or of the system, in lower case -> what it means."""
+"""Part of an error message of SQLite or the system, in lower case -> explanation."""
 VIEW = "scores"
-"""Name of the view of the table of runs, names and scores first; a tag of the experiment holds it, as its page would."""
+"""Name of the view of the table of runs with names and scores first, stored in a tag of the experiment, as by MLflow's page."""
 RUN_TAGS = ("method", "scenario", "seed")
 """Tags that are the first columns of the table of runs."""
 SEED_WIDTH, SCORE_WIDTH = 70, 200
-"""Widths of a column of seeds, and of others, pixels."""
+"""Widths of the seed column and of other columns, pixels."""
 LOCK_PATIENCE = 600.0
-"""Seconds to wait for another process that logs the same record or creates the database."""
+"""Maximum waiting time for another process that logs the same record or creates the database, s."""
 
 
 def default_uri(results: Path) -> str:
-    """The tracking URI of a results folder that has no server: a SQLite file in it."""
+    """The tracking URI of a results folder without a server: a SQLite file in the folder."""
     return f"sqlite:///{Path(results).resolve() / INDEX}"
 
 
 def lock(results: Path, name: str) -> BaseFileLock:
-    """A lock that the kernel frees when its holder dies. Its file stays: removing it would let two processes hold it."""
+    """A lock that the kernel releases when its holder dies. Its file is kept, because removing it would allow two holders."""
     from filelock import FileLock
 
     path = Path(results) / ".locks" / f"{name}.lock"
@@ -70,7 +70,7 @@ def lock(results: Path, name: str) -> BaseFileLock:
 
 
 def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
-    """A client and the experiment's id; creates what is missing. Raises whatever MLflow raises."""
+    """A client and the experiment's id; creates a missing database and experiment. Raises MLflow's exceptions."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     from mlflow import MlflowClient
@@ -81,9 +81,9 @@ def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
         from mlflow.store.db import utils
 
         utils.MAX_RETRY_COUNT = DATABASE_RETRIES
-        # A server has its own place for artifacts. Without a server MLflow would take ./mlruns of the first process, for ever.
+        # A server has its own artifact location. Without a server, MLflow would always use ./mlruns of the first process.
         location = (Path(results).resolve() / ARTIFACTS / settings.experiment).as_uri()
-    # MLflow breaks a new database for good when several processes create it at once.
+    # MLflow corrupts a new database if several processes create it at the same time.
     with lock(results, "init") if is_database else nullcontext():
         if settings.uri is None and location:
             _keep_moved(Path(results), settings.experiment, location)
@@ -95,28 +95,28 @@ def connect(results: Path, settings: Tracking) -> tuple[MlflowClient, str]:
 
 
 def _keep_moved(results: Path, experiment: str, location: str) -> None:
-    """Rename the index of a results folder that was moved or copied: it holds places of artifacts, and perhaps tags and notes."""
+    """Rename the index of a moved or copied results folder: its artifact paths are wrong, but it may contain tags and notes."""
     database = results / INDEX
     with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as db:
         rows = db.execute("SELECT artifact_location FROM experiments WHERE name = ?", [experiment]).fetchall()
         if rows and rows[0][0] != location:
-            kept = database.with_name(f"mlflow-{time.strftime('%Y%m%d-%H%M%S')}.db")
-            database.rename(kept)
-            print(f"{results} was moved: its MLflow index is made anew; the old one is kept as {kept.name}.", flush=True)
+            renamed = database.with_name(f"mlflow-{time.strftime('%Y%m%d-%H%M%S')}.db")
+            database.rename(renamed)
+            print(f"{results} was moved: a new MLflow index is created; the old index is now {renamed.name}.", flush=True)
 
 
 def explained(error: Exception, results: Path, settings: Tracking) -> str:
-    """The first line of an error of MLflow, short and without passwords; of a results folder's own index, with a way out."""
+    """The first line of an MLflow error, short and without passwords; for the index of a results folder, with the next move."""
     line = masked((str(error).strip().splitlines() or [""])[0] or type(error).__name__)[:300]
     if settings.uri is not None:
         return line
     reason = next((words for part, words in REASONS.items() if part in line.lower()), "")
-    return reason.format(results=results) or f"{line} (if that stays, rename {results}/{INDEX}; `neuspring sync` makes another)"
+    return reason.format(results=results) or f"{line} (if it persists, rename {results}/{INDEX} and run `neuspring sync`)"
 
 
 def _count_rows(database: Path) -> None:
-    """Statistics for SQLite's plans: without them 10,000 runs in the order of a score take it ten times as long."""
-    # They are kept in the database; where a job writes at this moment, those of another time do.
+    """Compute SQLite's query statistics, with which sorting 10,000 runs by a score is ten times faster."""
+    # The database stores the statistics. If a job is writing now, older statistics suffice.
     with closing(sqlite3.connect(database, timeout=1)) as db, suppress(sqlite3.OperationalError):
         db.execute("PRAGMA analysis_limit = 1000")
         db.execute("ANALYZE")
@@ -124,12 +124,12 @@ def _count_rows(database: Path) -> None:
 
 
 def score_name(task: str, metric: str, unit: str) -> str:
-    """A score's name in the index, which says the unit of lengths."""
+    """The name of a score in the index, with the unit for lengths."""
     return f"scores/{task}.{metric}" + ("_mm" if readable(0.0, unit)[1] == "mm" else "")
 
 
 def _view() -> dict[str, Any]:
-    """The state of MLflow's table of runs: method, scenario, seed, then every score; columns that no run has are not shown."""
+    """The state of MLflow's table of runs: method, scenario, seed, then all scores; MLflow hides columns that no run has."""
     from neuspring.scores.metrics import METRICS, TASKS
 
     tags = [f"tags.`{name}`" for name in RUN_TAGS]
@@ -140,12 +140,12 @@ def _view() -> dict[str, Any]:
 
 
 def page(results: Path, settings: Tracking) -> tuple[str, bool]:
-    """The place in MLflow's pages where the runs are, names and scores first; and whether the index is empty.
+    """The path of the runs in MLflow's pages, with names and scores first, and whether the index is empty.
 
-    Raises InputError where it cannot be shown.
+    Raises InputError if there are no runs, or if MLflow cannot open the index.
     """
     if settings.uri is None and not any(Path(results).glob(f"*/*/*/{RUN_RECORD}")):
-        rule = f"must hold runs (SCENARIO/METHOD/SEED/{RUN_RECORD})"
+        rule = f"must contain runs (SCENARIO/METHOD/SEED/{RUN_RECORD})"
         raise InputError(results, rule, "none", "Name a folder with runs: --results.")
     try:
         client, experiment = connect(results, settings)

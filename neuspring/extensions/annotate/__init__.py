@@ -1,6 +1,6 @@
-"""Masks by hand, in a browser: `neuspring annotate`.
+"""Masks from annotations that a user draws in the browser: `neuspring annotate`.
 
-server, guard            requests, and who is answered; static/ is the page: no build step, nothing from the network
-masks                    the state that all tabs share
-shared                   a file that several tabs edit; work in the background
+server    requests and access control; static/ is the page, without a build step and without network resources
+masks     the state that all tabs share
+shared    a file that several tabs edit; work in the background
 """

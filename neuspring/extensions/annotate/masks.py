@@ -1,4 +1,4 @@
-"""The masks mode: marks, a preview of one frame, carrying them through the video, saving what came out."""
+"""Masks mode: annotations, a preview of one frame, carrying through the video, saving masks."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from neuspring.perception.marks import MARKS, Marks
 from neuspring.perception.masks import MasksFile, save_carried, source_digest
 
 MOST_MARKS = 2000
-"""Marks of a camera: a limit for what a browser may send."""
+"""Largest number of annotations per camera that a browser may send."""
 
 
 @dataclass(frozen=True, eq=False)
 class CarriedMasks:
-    """Masks of one camera, as they were carried."""
+    """Carried masks of one camera."""
 
     packed: Sequence[bytes]
-    """The labels of each frame, compressed: a long film would not fit into memory."""
+    """Compressed labels of each frame; uncompressed, a long video would not fit into memory."""
     doubt: np.ndarray
-    """[T], 0 sure, 1 doubtful."""
+    """[T], 0 (certain) to 1."""
     marks: Marks
-    """Marks that the masks were carried from."""
+    """Annotations from which the masks were carried."""
     saved: bool = False
 
 
@@ -50,7 +50,7 @@ class MasksMode:
         self._lock, self._saving = Lock(), Lock()
 
     def plain(self) -> dict[str, Any]:
-        """Marks with their revision, the job, and what was carried, as plain values."""
+        """Annotations with their revision, the job, and carried masks, as plain values."""
         revision, marks = self.document.read()
         with self._lock:
             carried = {
@@ -66,31 +66,31 @@ class MasksMode:
         return {"revision": revision, "marks": plain(marks), "job": self.job.plain(), "carried": carried, "saved": saved}
 
     def write(self, revision: Any, values: Any) -> str:
-        """Replace the marks by plain values; returns the new revision. Raises Stale, InputError.
+        """Replace the annotations by plain values; returns the new revision. Raises Stale, InputError.
 
-        Half-done work is good too: the object may come last.
+        Annotations may be incomplete: the user may draw the object last.
         """
         if not isinstance(values, dict):
             raise InputError(MARKS, "a JSON object is required", type(values).__name__)
         cameras = values.get("cameras")
         for camera, marks in cameras.items() if isinstance(cameras, dict) else ():
             if isinstance(marks, list) and len(marks) > MOST_MARKS:
-                raise InputError(f"{MARKS}, cameras.{camera}", f"at most {MOST_MARKS} marks a camera", len(marks))
+                raise InputError(f"{MARKS}, cameras.{camera}", f"a camera must have at most {MOST_MARKS} annotations", len(marks))
         parsed = parse(Marks, values, MARKS)
         parsed.require(self.capture, whole=False)
         return self.document.write(revision, parsed)
 
     def preview(self, camera: str, frame: int) -> np.ndarray:
-        """Labels [H, W] of one marked frame from its marks alone. Raises InputError."""
+        """Labels [H, W] of one annotated frame, from its own annotations. Raises InputError."""
         return SEGMENTERS["marks"].outline(self.capture, camera, frame, self.document.read()[1].of(camera))
 
     def carry(self, cameras: Sequence[str]) -> None:
-        """Begin to carry the marks of cameras through the video. Raises InputError, Busy."""
+        """Start to carry the annotations of cameras through the video. Raises InputError, Busy."""
         marks = self.document.read()[1]
-        unmarked = [camera for camera in cameras if not marks.of(camera)]
-        if unmarked or not cameras:
-            where = f"camera {', '.join(unmarked)}" if unmarked else "the capture"
-            raise InputError(where, "the object must be marked in a frame", "no marks", "Draw a box around it first.")
+        missing = [camera for camera in cameras if not marks.of(camera)]
+        if missing or not cameras:
+            where = f"camera {', '.join(missing)}" if missing else "the capture"
+            raise InputError(where, "the object must be annotated in a frame", "no annotations", "Draw a box around it first.")
         self.job.start(lambda report: self._carry(list(cameras), marks, report))
 
     def _carry(self, cameras: Sequence[str], marks: Marks, report: Report) -> str:
@@ -107,10 +107,10 @@ class MasksMode:
                 self._results[camera] = CarriedMasks([zlib.compress(labels, 1) for labels in carried.labels], carried.doubt, marks)
         names = f"{'camera' if len(cameras) == 1 else 'cameras'} {', '.join(cameras)}"
         frames = f"{doubtful or 'no'} very doubtful frame{'' if doubtful == 1 else 's'}"
-        return f"Carried {names}; {frames}. Look at the frames that are listed, then save."
+        return f"Carried {names}; {frames}. Check the listed frames, then save."
 
     def labels(self, camera: str, frame: int, source: str) -> np.ndarray | None:
-        """Labels [H, W] of a frame, `carried` just now or `saved` in the capture; None where there are none."""
+        """Labels [H, W] of a frame, `carried` by this server or `saved` in the capture; None if there are none."""
         if source == "carried":
             with self._lock:
                 result = self._results.get(camera)
@@ -119,12 +119,12 @@ class MasksMode:
         return self.capture.mask(camera, frame) if source == "saved" and exists else None
 
     def save(self) -> list[str]:
-        """Write what was carried to the capture; returns the cameras. Raises InputError where nothing was carried."""
+        """Write carried masks to the capture; returns the cameras. Raises InputError without carried masks."""
         with self._lock:
             results = dict(self._results)
         if not results:
-            raise InputError("masks", "there must be masks to save", "none", "Carry the marks through the video first.")
-        # Two tabs would write the same files, and the record of one of them would be lost.
+            raise InputError("masks", "there must be masks to save", "none", "Carry the annotations through the video first.")
+        # Prevents two tabs from writing the same files and losing a record.
         with self._saving:
             for camera, result in results.items():
                 source = source_digest(self.capture, camera, result.marks.of(camera), "marks")
@@ -140,6 +140,6 @@ class MasksMode:
         return np.frombuffer(zlib.decompress(labels), np.uint8).reshape(view.height, view.width)
 
     def saved_cameras(self) -> list[str]:
-        """Cameras with a mask in the capture."""
+        """Cameras that have a mask in the capture."""
         frames = range(self.capture.frame_count)
         return [c for c in self.capture.cameras if any(self.capture.path("mask", c, frame).exists() for frame in frames)]

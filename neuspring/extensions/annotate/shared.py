@@ -1,4 +1,4 @@
-"""State that all tabs share: a file that each may edit, and one piece of long work at a time."""
+"""State that all tabs share: a file that each tab may edit, and one background job at a time."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ T = TypeVar("T")
 
 
 class Stale(Exception):
-    """The file changed since the state that a write started from."""
+    """The file changed after the revision on which a write is based."""
 
 
 class Document(Generic[T]):
-    """A file, read and written whole. Every write names the revision that it started from, and a stale one is refused.
+    """A file that is read and written as one value. Each write names the revision on which it is based; stale writes are refused.
 
-    The revision is a digest of the file's bytes, so that changes by other programs count too; "none" without a file.
+    The revision is a digest of the file's bytes, so that changes by other programs count too. It is "none" without a file.
     """
 
     def __init__(self, path: Path, load: Callable[[], T], save: Callable[[T], object]) -> None:
         self.path, self._load, self._save, self._lock = path, load, save, Lock()
 
     def read(self) -> tuple[str, T]:
-        """Its revision and its value. Raises InputError for a damaged file."""
+        """Revision and value of the file. Raises InputError for a damaged file."""
         with self._lock:
             return self._revision(), self._load()
 
@@ -46,23 +46,23 @@ class Document(Generic[T]):
 
 
 Report = Callable[[str, int, int], None]
-"""Progress of work, as it calls it: (what, done, of all). Raises Stopped when the user stopped the work."""
+"""Progress callback of a job: (step, done, total). Raises Stopped after the user stopped the job."""
 
 
 class Stopped(Exception):
-    """The user stopped the work."""
+    """The user stopped the job."""
 
 
 class Busy(Exception):
-    """Other work has not ended."""
+    """Another job is running."""
 
 
 IDLE = {"state": "idle", "what": "", "done": 0, "total": 0, "seconds": 0.0, "message": ""}
-"""State of a job: idle, running, done, failed or stopped; what it does, how far it is, and what it says at the end."""
+"""State of a job: idle, running, done, failed or stopped; its step, progress and final message."""
 
 
 class BackgroundJob:
-    """At most one piece of work, in a thread, with its progress and a way to stop it."""
+    """At most one job in a thread, with progress and a stop request."""
 
     def __init__(self) -> None:
         self._lock, self._stop, self._began = Lock(), Event(), 0.0
@@ -70,10 +70,10 @@ class BackgroundJob:
         self._thread: Thread | None = None
 
     def start(self, work: Callable[[Report], str]) -> None:
-        """Begin; `work` returns the sentence that says what it did. Raises Busy."""
+        """Start `work`, which returns its final message. Raises Busy."""
         with self._lock:
             if self._state["state"] == "running":
-                raise Busy("Masks are being carried. Wait for the end, or stop it.")
+                raise Busy("A job is already carrying masks. Wait for its end, or stop it.")
             self._stop.clear()
             self._began = monotonic()
             self._state = IDLE | {"state": "running"}
@@ -81,11 +81,11 @@ class BackgroundJob:
             self._thread.start()
 
     def stop(self) -> None:
-        """Ask the work to end at its next report."""
+        """Request the job to end at its next report."""
         self._stop.set()
 
     def join(self) -> None:
-        """Wait for the end."""
+        """Wait for the end of the job."""
         if self._thread:
             self._thread.join()
 
@@ -99,12 +99,12 @@ class BackgroundJob:
         try:
             self._set(state="done", message=work(self._report))
         except Stopped:
-            self._set(state="stopped", message="Stopped. Earlier results are kept.")
+            self._set(state="stopped", message="Stopped. Earlier masks are kept.")
         except (InputError, NumericalFailure) as error:
             self._set(state="failed", message=str(error))
-        except Exception as error:  # the thread's end: the page must hear of it, and the terminal gets the trace
+        except Exception as error:  # the page shows the error, the terminal its traceback
             logging.getLogger(__name__).exception("the work failed")
-            self._set(state="failed", message=f"{type(error).__name__}: {error}. The terminal shows where.")
+            self._set(state="failed", message=f"{type(error).__name__}: {error}. The terminal shows the traceback.")
 
     def _report(self, what: str, done: int, total: int) -> None:
         if self._stop.is_set():

@@ -1,4 +1,4 @@
-"""Backends of perception that the entry points name; nothing heavy is imported."""
+"""Perception backends of the entry points; imports nothing heavy."""
 
 from neuspring.perception.backends import Backend
 

@@ -1,4 +1,4 @@
-"""What one picture cannot say of a body, and hands and points that are followed badly in it."""
+"""Checks of one color camera: the unknown pose of the object, and badly tracked hands and points."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from neuspring.core.findings import Finding
 from neuspring.data.results import LiftedTracks, ShapePrior
 
 RISES = 0.05
-"""Part of a body that is not laid onto the table, because it would lie too far behind. Two sloths that lie have up to 0.03."""
+"""Raised fraction of an object above which the pose is a warning. Two lying sloths have up to 0.03."""
 RESIZED = 1.8
-"""Change of a hand's apparent size."""
+"""Largest credible change of a hand's apparent size, as a factor."""
 
 
 def findings_of(lifted: LiftedTracks, prior: ShapePrior, up: float, image: ImageObservations) -> list[Finding]:
-    """Findings about points in the world, the shape and the evidence in the image; `up` is +1 or -1."""
+    """Findings about points, shape and image evidence; `up` is +1 or -1."""
     found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
     found += examine("pose", "shape", lifted) + examine("visible points", "tracks", image.visible[: len(image.inside)])
     return found + examine("hands in the image", "hands", image)
 
 
 def supposed_pose(lifted: LiftedTracks) -> dict[str, Any] | None:
-    """Share of a body that is supposed to rise, where color alone shows it and nothing says whether it lies or stands."""
+    """Raised fraction of an object of unknown pose; None if the pose is given, or for sheets and ropes."""
     if lifted.backend != "color alone, body":
         return None
     deep, across, raised = (lifted.facts[f"shape_{name}"] for name in ("longest", "across", "raised"))
-    rises = f", so {raised:.0%} of it is supposed to rise" if raised > RISES else ""
+    rises = f", so {raised:.0%} of it is assumed to rise" if raised > RISES else ""
     level = "warning" if raised > RISES else "note"
     return {"value": raised, "deep": 100 * deep, "across": 100 * across, "rises": rises, "level": level}
 
 
 def hand_sizes(image: ImageObservations) -> dict[str, Any] | None:
-    """Apparent sizes of hands, as multiples of those in frame 0, that change more than at arm's length."""
+    """Apparent sizes of hands relative to frame 0; None if they change by less than RESIZED."""
     if not image.hands:
         return None
     least, most = float(image.hand_sizes.min()), float(image.hand_sizes.max())
@@ -45,9 +45,9 @@ def hand_sizes(image: ImageObservations) -> dict[str, Any] | None:
 # fmt: off
 checks = (
     Check("pose", "pose", supposed_pose, None, "note",
-          "if it lies, it reaches {deep:.0f} cm behind its nearest point and is {across:.0f} cm wide{rises}; one picture cannot "
-          "say whether it lies or stands.", 'Write "pose": "lying" or "standing" in capture.json.'),
+          "a lying object would be {deep:.0f} cm deep and {across:.0f} cm wide{rises}; one image does not show the pose.",
+          'Set "pose": "lying" or "standing" in capture.json.'),
     Check("size of hands", "hands in the image", hand_sizes, None, "warning",
-          "a hand appears {least:.2f} to {value:.2f} times as large as in frame 0; a hand at arm's length changes by less than "
-          f"{RESIZED:g} times; it was not followed well.", "Look at hands.png, and mark the hands anew."),
+          f"a hand's size is {{least:.2f}} to {{value:.2f}} times that in frame 0 (limit: {RESIZED:g}); its track may be wrong.",
+          "Look at hands.png, and annotate the hands again."),
 )

@@ -1,26 +1,30 @@
-"""The object in frame 0 is its silhouette, lying on the table.
+"""Shape of the object in frame 0 from its silhouette and the table z = 0.
 
-With up as +z, the pixel p shows the object's upper side at height t(p), where its ray meets the plane z = t(p):
+With up as +z, the ray of pixel p meets the object's upper side at the height t(p):
 
-    sheets   (flat, such as cloth)           t = SHEET_THICKNESS; nodes lie at t / 2
-    ropes    (round), bodies (all others)  t of the nearest of the ellipsoids below, and their lower side is that of the farthest
+    sheets (flat, such as cloth)         t = SHEET_THICKNESS; nodes are at t / 2
+    ropes (round), bodies (all others)   front of the nearest ellipsoid below; their lower side is the back of the farthest one
 
-Each of the largest discs inside the silhouette (`discs`), with center q and radius r, pixels, is an ellipsoid that is
-w = 2 k r z / f thick, k = 1 for ropes and BODY_THICKNESS for bodies: thickness follows the outline's width, symmetric about the
-medial surface on which the centers lie. f is the focal length, z the depth of the center. Where it lies on the table its center is
-at half its thickness above it:
+Each of the largest discs inside the silhouette (`discs`), with center q and radius r, pixels, becomes an ellipsoid of thickness
+
+    w = 2 k r z / f,   k = 1 for ropes, BODY_THICKNESS for bodies
+
+f is the focal length, z the depth of the center. The object is symmetric about the surface through the centers. The center of an
+ellipsoid that rests on the table is at half its thickness:
 
     z = h / (d(q) + k r / f)
 
-h is the height of the camera and d(q) how far the ray of q sinks per meter of depth. What stands would be laid far behind itself
-so. Therefore no center is farther from the camera than the upright plane
+h is the height of the camera, and d(q) the descent of the ray of q per meter of depth. This would place a standing object far
+behind its true position. Therefore no center is beyond an upright plane:
 
     a(q) <= min a + FOOTPRINT (max s - min s)
 
-a is the distance along the table in the direction in which the camera looks, s that across, on the plane through the nearest
-center. What would be beyond the plane rises in it, above what touches the table. `pose` of the capture says lying (no such plane)
-or standing (STANDING_FOOTPRINT): one picture cannot say which. What hangs in the air (`ground: false`) lies in the upright plane
-through its nearest point on the table, sheets too: nothing says how far it is.
+a is the distance along the table in the viewing direction. s is the distance across, on the plane through the nearest center.
+Centers that would be beyond the plane rise in it.
+
+One image does not show the pose, so `pose` of the capture states it: lying (no such plane) or standing (STANDING_FOOTPRINT). An
+object in the air (`ground: false`), also a sheet, is in the upright plane through its nearest point on the table, because its
+distance is unknown.
 """
 
 from __future__ import annotations
@@ -38,55 +42,55 @@ from neuspring.extensions.color_alone.pixels import disc, pixels_of
 from neuspring.perception.shape import discs
 
 SILHOUETTES = {"cloth": "flat", "package": "flat", "rope": "round"}
-"""Shape of an object by its category: flat is a sheet, round is as thick as it is wide; all others are bodies."""
+"""Shape by category: flat for sheets, round for objects as thick as wide; all others are bodies."""
 BENEATH = 0.03
-"""Part of the object that a hand hides in frame 0: its pixels between pixels of the object, up to this far from them, m."""
+"""m: hand pixels between object pixels hide the object in frame 0 if they are within this distance of them."""
 SHEET_THICKNESS = 0.004
 """m."""
 BODY_THICKNESS = 0.9
-"""Thickness of a body, which is neither sheet nor rope, in local widths of its silhouette; 1: as thick as it is wide."""
+"""Thickness of a body relative to the local width of its silhouette."""
 FOOTPRINT, STANDING_FOOTPRINT = 1.2, 0.3
-"""Farthest that a body reaches away from the camera, measured along the table from its nearest point, in widths of its middle line
-across the view; what would lie farther off rises. For a pose that is not given, and a standing one; a lying body rises nowhere."""
+"""Largest extent of a body away from the camera, along the table from its nearest point, relative to its width across the view.
+For an unknown and for a standing pose; parts farther away rise. A lying body does not rise."""
 ROPE_WIDEST = 1.5
-"""Largest thickness of a rope over its median."""
+"""Largest thickness of a rope relative to its median."""
 LEVEL_VIEW = 0.35
-"""Part of a view's direction that is level, below which the camera looks down on things: nothing rises in its picture."""
+"""Horizontal component of the viewing direction below which the camera looks down, and nothing rises."""
 
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """Place of the object in frame 0; up is +1 or -1."""
+    """Shape of the object in frame 0; up is +1 or -1."""
 
     camera: Camera
     up: float
     kind: str
     """flat, round or body."""
     filled: np.ndarray
-    """[H, W] bool: the object, and what of it lies beneath hands."""
+    """[H, W] bool: the object, including parts beneath hands."""
     heights: np.ndarray
-    """t [H, W], m; 0 outside."""
+    """Height t of the upper side [H, W], m; 0 outside."""
     lower: np.ndarray
     """Height of the lower side [H, W], m; 0 outside."""
     pixel_size: float
-    """Width of a pixel at the object, m (median)."""
+    """Median width of a pixel at the object, m."""
     facts: dict[str, float]
-    """Suppositions about a rope or a body: `longest`, how far behind its nearest point it would lie on the table, m; `across`,
-    its width there, m; and `raised`, the part of its discs that rises instead."""
+    """For ropes and bodies: `longest`, extent behind the nearest point if it were lying, m; `across`, width, m; `raised`,
+    fraction of discs that rise."""
 
     @classmethod
     def of(cls, capture: Capture, labels: np.ndarray) -> FirstFrame:
-        """From the labels [H, W] of frame 0. Raises InputError without an object in view of the table."""
+        """Make it from the labels [H, W] of frame 0. Raises InputError without an object in front of the table."""
         camera = next(iter(capture.cameras.values()))
         category = capture.description.category
         kind = SILHOUETTES.get(category, "body")
         if not (labels == OBJECT).any():
-            raise InputError(f"{capture.folder}, masks of frame 0", "the object must be in view", "none of its pixels")
+            raise InputError(f"{capture.folder}, masks of frame 0", "the object must be in view", "no object pixel")
         below = camera_depth(camera, pixels_of(labels == OBJECT), 0.0)
         if not (np.isfinite(below) & (below > 0)).all():
-            rule = "every pixel of the object in frame 0 must look at the table, z = 0"
-            remedy = "Check camera_to_world and up: without depth the table is where they say."
-            raise InputError(f"{capture.folder / CAPTURE}, camera_to_world", rule, "some look above the horizon", remedy)
+            rule = "the ray of each object pixel in frame 0 must meet the table, z = 0"
+            remedy = "Check camera_to_world and up: without depth, they determine the table."
+            raise InputError(f"{capture.folder / CAPTURE}, camera_to_world", rule, "rays above the horizon", remedy)
         size = float(np.median(below)) / camera.intrinsics[0, 0]
         filled = beneath_hands(labels, BENEATH / size)
         up = capture.description.up_sign
@@ -97,30 +101,30 @@ class FirstFrame:
             return cls(camera, up, kind, filled, heights, lower, size, facts)
         if kind == "flat":
             middle = upright_depth(camera, pixels)
-            found = [middle - SHEET_THICKNESS / 2, middle + SHEET_THICKNESS / 2]
+            sides = [middle - SHEET_THICKNESS / 2, middle + SHEET_THICKNESS / 2]
         else:
             bounds = {None: FOOTPRINT, "lying": np.inf, "standing": STANDING_FOOTPRINT}
             footprint = 0.0 if hangs else np.inf if kind == "round" else bounds[capture.description.pose]
-            # Where the silhouette is wider than a rope it shows two turns, or a shadow.
+            # A silhouette wider than a rope shows two turns, or a shadow.
             shape = (1.0, footprint, ROPE_WIDEST) if kind == "round" else (BODY_THICKNESS, footprint)
             depth, thick, facts = medial(camera, up, filled, *shape)
-            found = [side[filled] for side in inflated(filled, depth, thick)]
-        for side, depth in zip((heights, lower), found, strict=True):
-            # The table cuts off what would be below it.
+            sides = [side[filled] for side in inflated(filled, depth, thick)]
+        for side, depth in zip((heights, lower), sides, strict=True):
+            # The table cuts off parts below it.
             side[filled] = np.maximum(up * camera.lift(pixels, depth)[:, 2], 0.0)
         return cls(camera, up, kind, filled, heights, lower, size, facts)
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """World points [n, 3], m, of pixels (x, y) [n, 2]: of a sheet its middle, of others their upper side.
+        """World points [n, 3], m, of pixels (x, y) [n, 2]: the middle of a sheet, the upper side of other objects.
 
-        Pixels outside of the silhouette have the height of its nearest pixel.
+        Pixels outside the silhouette get the height of its nearest pixel.
         """
         return self._lifted(pixels, 0.5 if self.kind == "flat" else 1.0)
 
     def fingers(self, pixels: np.ndarray) -> np.ndarray:
-        """World points [n, 3], m, where fingers hold the object: a sheet by its upper side, others at half their height.
+        """World points [n, 3], m, of a grasp: the upper side of a sheet, half the height of other objects.
 
-        There is no point of the object there (`points`): a spring between the two would have no length.
+        They differ from `points`, because a spring between a controller and a node must have a length.
         """
         return self._lifted(pixels, 1.0 if self.kind == "flat" else 0.5)
 
@@ -128,7 +132,7 @@ class FirstFrame:
         return self.camera.lift(pixels.astype(float), camera_depth(self.camera, pixels, self._up(pixels, share)))
 
     def _up(self, pixels: np.ndarray, share: float) -> np.ndarray:
-        """z at pixels [n], m: of the upper side (share 1), the lower one (0), or between."""
+        """z at pixels [n], m, of the upper side (share 1), of the lower side (0), or between."""
         _, labels = cv2.distanceTransformWithLabels((~self.filled).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         height_of = np.zeros(labels.max() + 1)
         height_of[labels[self.filled]] = self._between(share)[self.filled]
@@ -140,7 +144,7 @@ class FirstFrame:
         return np.asarray(self.lower + share * (self.heights - self.lower))
 
     def depths(self, share: float) -> np.ndarray:
-        """Depth [H, W], m, of the upper side (share 1) or of the lower one (0); 0 outside."""
+        """Depth [H, W], m, of the upper side (share 1) or of the lower side (0); 0 outside."""
         filled, depth = self.filled, np.zeros(self.filled.shape)
         depth[filled] = camera_depth(self.camera, pixels_of(filled), self.up * self._between(share)[filled])
         return depth
@@ -149,10 +153,10 @@ class FirstFrame:
 def medial(
     camera: Camera, up: float, filled: np.ndarray, factor: float, footprint: float, widest: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
-    """Depth [n] and thickness [n], m, of the ellipsoids of the `discs` of a silhouette `filled` [H, W], and `FirstFrame.facts`.
+    """Depth [n] and thickness [n], m, of the ellipsoids of a silhouette `filled` [H, W], and `FirstFrame.facts`.
 
-    `factor` is k and FOOTPRINT that of the head of this file; up is +1 or -1. No ellipsoid is thicker than `widest` times the
-    median one.
+    `factor` is k and `footprint` is FOOTPRINT in the equations above; up is +1 or -1. No ellipsoid is thicker than `widest` times
+    the median.
     """
     centers, radii, _ = discs(filled)
     rays = camera.rays(centers)
@@ -165,8 +169,8 @@ def medial(
     away, aside = depth * (rays[:, :2] @ (x, y)) / level, depth * (rays[:, :2] @ (-y, x)) / level
     nearest = away.min()
     across, shorter = float(np.ptp(aside)), np.ones(len(away))
-    # A camera that looks down sees all of the footprint, and bodies may lie on both sides of it. A body that reaches no farther
-    # than it is thick lies in any case.
+    # A camera that looks down sees the full footprint, on both sides of its position. An object that reaches no farther than
+    # it is thick rests on the table in any case.
     if level > LEVEL_VIEW and nearest > 0 and np.ptp(away) > (depth * thick).max() / factor:
         across = max(float(np.ptp(aside * nearest / away)), 1e-6)
         shorter = np.minimum((nearest + footprint * across) / away, 1.0)
@@ -175,7 +179,7 @@ def medial(
 
 
 def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> np.ndarray:
-    """Depth [n], m along the optical axis, at which the rays of pixels (x, y) [n, 2] meet the planes at z [n]; inf: never."""
+    """Depth [n], m along the optical axis, at which the rays of pixels (x, y) [n, 2] meet the planes at z [n]; inf if never."""
     rays = camera.rays(pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (z - camera.camera_to_world[2, 3]) / rays[:, 2]
@@ -183,9 +187,9 @@ def camera_depth(camera: Camera, pixels: np.ndarray, z: np.ndarray | float) -> n
 
 
 def upright_depth(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Depth [n], m, of pixels (x, y) [n, 2] in the upright plane that faces the camera, through the nearest of them on the table.
+    """Depth [n], m, of pixels (x, y) [n, 2] in the upright plane that faces the camera, through the nearest pixel on the table.
 
-    On the table where the camera looks down.
+    If the camera looks down, depth on the table.
     """
     below, axis = camera_depth(camera, pixels, 0.0), camera.camera_to_world[:2, 2]
     along = camera.rays(pixels)[:, :2] @ axis
@@ -195,9 +199,9 @@ def upright_depth(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 
 def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
-    """The object [H, W] bool with what hands hide of it: their pixels that lie between pixels of the object.
+    """The object [H, W] bool including parts beneath hands: hand pixels between object pixels.
 
-    A hand's pixel lies between them if it is in the object's closing by a disc of radius `reach`, pixels.
+    A hand pixel counts if it is in the morphological closing of the object by a disc of radius `reach`, pixels.
     """
     radius = max(round(reach), 1)
     padded = np.pad((labels == OBJECT).astype(np.uint8), radius)
@@ -206,12 +210,15 @@ def beneath_hands(labels: np.ndarray, reach: float) -> np.ndarray:
 
 
 def inflated(mask: np.ndarray, depth: np.ndarray, widest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the front and of the back [H, W], m, of the ellipsoids whose outlines are the `discs` of a silhouette `mask` [H, W].
+    """Depth of front and back [H, W], m, of the ellipsoids over the `discs` of a silhouette `mask` [H, W]; zero outside.
 
-    The disc at q with radius r belongs to an ellipsoid with its center at `depth` [n] and `widest` [n] thick, m. The pixel p shows
-    its surfaces at depth_q -+ widest_q / 2 sqrt(1 - |p - q|^2 / r^2); the front is the nearest of all, the back the farthest.
-    Pixels that no disc covers, of pointed corners, are as thick as their distance from the edge says, about the middle of the
-    nearest other pixel. Zero outside.
+    The disc at q with radius r is the outline of an ellipsoid with center depth `depth` [n] and thickness `widest` [n], m. At
+    pixel p, its surfaces are at
+
+        depth_q -+ widest_q / 2 sqrt(1 - |p - q|^2 / r^2)
+
+    The front is the nearest of all, the back the farthest. In pointed corners that no disc covers, the thickness follows the
+    distance from the edge, about the middle of the nearest covered pixel.
     """
     centers, radii, distance = discs(mask)
     front, back = np.full(mask.shape, np.inf), np.full(mask.shape, -np.inf)

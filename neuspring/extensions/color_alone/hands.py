@@ -1,19 +1,19 @@
-"""Hands in front of one camera without depth: where the grip of each is in the image, how it is turned and how large it appears,
-in all frames, and where its controllers are in space.
+"""Hands of one camera without depth: position, rotation and apparent size of each grasp in the image, and controllers in 3D.
 
-Corners of the hand near its grip are followed from frame to frame (pyramidal Lucas-Kanade, forward and backward) in images in
-which all but the hand's mask is gray: nothing else is read. Between a key frame and the present frame, a similarity is fitted to
-the corners that are left (RANSAC). Where too few are left, the present frame becomes the key frame, and errors add up. So each
-frame is compared with frame 0 too: where enough of its corners are found again, their similarity is the pose, and what the way
-from frame to frame had missed is spread evenly over the frames since the last such frame. Sizes and turns are smoothed over time.
+**Image.** Pyramidal Lucas-Kanade with a forward-backward check tracks corners near the grasp. It reads images in which all pixels
+outside the hands' mask are gray. RANSAC fits a similarity to the remaining corners between a key frame and the present frame. If
+too few corners remain, the present frame becomes the key frame, and errors accumulate. Therefore each frame is also compared with
+frame 0: if enough of its corners are found again, their similarity is the pose, and the accumulated error is distributed linearly
+over the frames since the last such frame. Sizes and angles are smoothed over time.
 
-Nothing says how far a hand is. It is supposed to move in the upright plane that faces the camera, through its grip of frame 0, and,
-above a table, not to go below the level of that grip. With the grip in the image at u(t), the depth z(t) along the optical axis is
+**Depth.** The distance of a hand is not observed. A hand is assumed to move in the upright plane that faces the camera, through
+its grasp in frame 0, and above a table not below the level of that grasp. With the grasp in the image at u(t), its depth z(t)
+along the optical axis is
 
-    z(t) / z(0) = min(p(t), l(t)), p(t) without a table
+    z(t) / z(0) = min(p(t), l(t)),   p(t) without a table
 
-p and l are the depths at which the ray through u(t) meets the upright plane and the level one, over that of frame 0. The hand is a
-rigid patch: it keeps its shape, is turned by its angle in the image about the ray, and follows z(t) and u(t).
+p and l are the depths at which the ray through u(t) meets the upright and the level plane, relative to frame 0. The hand is a
+rigid patch, which rotates about the ray by its angle in the image and moves with u(t) and z(t).
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from neuspring.extensions.color_alone.pixels import away_from, disc, pixels_of
 from neuspring.perception.figures import STRIP_FRAMES
 
 CORNERS, LEAST_CORNERS, CORNERS_KEPT = 120, 6, 0.5
-"""Corners of a key frame, fewest for a fit, and the share of them below which there is a new key frame."""
+"""Number of corners of a key frame, fewest for a fit, and fraction below which a new key frame starts."""
 CORNER_EDGE = 2
-"""px: corners are this far within the mask, so that its own outline is not followed."""
+"""px: distance of corners from the border of the mask, whose outline must not be tracked."""
 CORNERS_AGAIN = 0.4
-"""Share of the corners of frame 0 that must agree, at least twice LEAST_CORNERS, for a frame to be one like frame 0."""
+"""Fraction of the corners of frame 0, and at least 2 LEAST_CORNERS, that must agree to compare a frame with frame 0."""
 STEADY = 5
-"""Frames like frame 0 whose median says what the way had missed."""
+"""Number of compared frames in the median of the accumulated error."""
 CORNER_BACKWARD = 0.7
-"""px by which a corner may miss its start."""
+"""Largest forward-backward error of a corner, px."""
 CORNER_WINDOW = 15
 GRAY = 128
 SMOOTH = 9
-"""Frames over which size and turn are smoothed (Savitzky-Golay, second order)."""
+"""Window of the second-order Savitzky-Golay filter of sizes and angles, frames."""
 LARGEST_STEP = 1.15
-"""Change of size from frame to frame beyond which a fit is not believed."""
+"""Largest credible change of size between frames, as a factor."""
 NEAREST_HAND, FARTHEST_HAND = 0.5, 2.0
-"""Depth of a hand over that of frame 0: beyond, the plane is seen edge on and says nothing."""
+"""Range of the depth of a hand relative to frame 0; beyond, the plane is edge-on and undetermined."""
 
 
 @dataclass(frozen=True)
@@ -58,21 +58,21 @@ class HandMotion:
     """Motion of H hands in the image."""
 
     centers: np.ndarray
-    """[T, H, 2] px: the grip."""
+    """Grasp [T, H, 2], px."""
     angles: np.ndarray
     """[T, H] rad, from x to y, since frame 0."""
     sizes: np.ndarray
-    """[T, H], over those of frame 0."""
+    """[T, H], relative to frame 0."""
     lost: int
-    """Frames in which some hand was not followed: it moves as before."""
+    """Number of frames in which a hand was not tracked and its motion was continued."""
 
 
 def grips(labels: np.ndarray, filled: np.ndarray, reach: float, apart: float, length: float = np.inf) -> list[np.ndarray]:
-    """Pixels (x, y) [n, 2] of each hand that hold the object in frame 0.
+    """Pixels (x, y) [n, 2] of each hand that grasp the object in frame 0; distances in pixels.
 
-    They are those of the hands' mask within `reach` of the object, or, if there are none, the nearest ones. Pieces of them that
-    lie `apart` or more from each other (pixels) are different hands. Of each, those within `length` of its tip hold, the pixel that
-    lies farthest along the arm; all, where no arm enters the image.
+    Pixels of the hands' mask grasp if they are within `reach` of the object; if there are none, the nearest ones do. Groups of
+    them at least `apart` from each other are different hands. If an arm enters the image, only pixels within `length` of the
+    hand's tip grasp; the tip is the pixel farthest along the arm.
     """
     away = away_from((labels == OBJECT) | filled)
     hands = labels == HANDS
@@ -80,24 +80,24 @@ def grips(labels: np.ndarray, filled: np.ndarray, reach: float, apart: float, le
         return []
     near = hands & (away <= max(reach, float(away[hands].min()) + 2.0))
     count, pieces = cv2.connectedComponents(cv2.dilate(near.astype(np.uint8), disc(max(round(apart / 2), 1))))
-    found = [pixels_of(near & (pieces == piece)) for piece in range(1, count)]
-    largest = max(len(one) for one in found)
-    # Specks of a mask are no hands.
-    found = [one for one in found if len(one) >= 0.1 * largest]
+    grasps = [pixels_of(near & (pieces == piece)) for piece in range(1, count)]
+    largest = max(len(pixels) for pixels in grasps)
+    # Specks of a mask are not hands.
+    grasps = [pixels for pixels in grasps if len(pixels) >= 0.1 * largest]
     if np.isinf(length):
-        return found
+        return grasps
     held, distance = [], along_arms(hands)
-    for one in found:
-        along = distance[one[:, 1], one[:, 0]]
-        from_tip = np.linalg.norm(one - one[int(along.argmax())], axis=1)
-        held.append(one[from_tip <= length] if along.any() else one)
+    for pixels in grasps:
+        along = distance[pixels[:, 1], pixels[:, 0]]
+        from_tip = np.linalg.norm(pixels - pixels[int(along.argmax())], axis=1)
+        held.append(pixels[from_tip <= length] if along.any() else pixels)
     return held
 
 
 def along_arms(hands: np.ndarray) -> np.ndarray:
-    """Distance [H, W], px within the mask [H, W] bool, from where arms enter the image; 0 where none does.
+    """Distance [H, W] within the mask [H, W] bool from the pixels at which arms enter the image, px; 0 without an arm.
 
-    Counted in dilations by a square and a cross in turn: at most 12 % off.
+    Alternating dilations by a square and a cross give it with at most 12 % error.
     """
     distance, reached = np.zeros(hands.shape), hands.copy()
     reached[1:-1, 1:-1] = False
@@ -111,7 +111,7 @@ def along_arms(hands: np.ndarray) -> np.ndarray:
 
 
 def follow_hands(capture: Capture, camera: str, labels: np.ndarray, held: list[np.ndarray], radius: float) -> HandMotion:
-    """Follow the grips `held` of frame 0 through all frames; labels [T, H, W]. Corners lie within `radius` px of the grip."""
+    """Track the grasps `held` of frame 0 through all frames; labels [T, H, W]. Corners are within `radius` px of a grasp."""
     hands = [_follow(capture, camera, labels, grip.mean(axis=0), radius) for grip in held]
     poses = np.stack([pose for pose, _ in hands], axis=1)
     angles, sizes = np.unwrap(poses[..., 2], axis=0), poses[..., 3]
@@ -123,7 +123,7 @@ def follow_hands(capture: Capture, camera: str, labels: np.ndarray, held: list[n
 
 
 def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarray, radius: float) -> tuple[np.ndarray, int]:
-    """(x, y, angle, size) of one hand in every frame [T, 4], and how often it was lost."""
+    """Pose (x, y, angle, size) of one hand in all frames [T, 4], and the number of frames in which it was lost."""
     frames, lost = capture.frame_count, 0
     poses = np.zeros((frames, 4))
     poses[0] = [*center, 0.0, 1.0]
@@ -132,7 +132,7 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
     start = points = corners
     missed, known = np.zeros_like(poses), [0]
     for frame in range(1, frames):
-        # A hand that is not followed goes on as it went, half as fast.
+        # A lost hand continues its motion at half speed.
         step = poses[frame - 1] - poses[frame - 2] if frame > 1 else np.zeros(4)
         poses[frame] = poses[frame - 1] + 0.5 * step * [1.0, 1.0, 0.0, 0.0]
         if not capture.has(camera, frame):
@@ -153,42 +153,42 @@ def _follow(capture: Capture, camera: str, labels: np.ndarray, center: np.ndarra
         before = now
         if not len(corners):
             continue
-        x, y, turn, size = poses[frame] + missed[known[-1]]
-        offsets = (corners - center) @ np.array([1, 1j]) * size * np.exp(1j * turn)
+        x, y, angle, size = poses[frame] + missed[known[-1]]
+        offsets = (corners - center) @ np.array([1, 1j]) * size * np.exp(1j * angle)
         again, ok = _flow(first, now, corners, np.stack([x + offsets.real, y + offsets.imag], axis=1))
         pose = _similarity(poses[0], corners[ok], again[ok], max(2 * LEAST_CORNERS, CORNERS_AGAIN * len(corners)))
         if pose is not None:
             missed[frame] = pose - poses[frame]
             known.append(frame)
-    # One that is like frame 0 in few corners may be wrong.
+    # A comparison with few corners may be wrong.
     steady = ndimage.median_filter(missed[known], (STEADY, 1))
     spread = [np.interp(np.arange(frames), known, column) for column in steady.T]
     return poses + np.stack(spread, axis=1), lost
 
 
 def _hand_image(capture: Capture, camera: str, labels: np.ndarray, frame: int) -> np.ndarray:
-    """Gray image [H, W] uint8 of the hands alone."""
+    """Gray image [H, W] uint8 that shows only the hands."""
     if not capture.has(camera, frame):
         return np.full(labels.shape[1:], GRAY, np.uint8)
     return np.where(labels[frame] == HANDS, gray(capture, camera, frame), GRAY).astype(np.uint8)
 
 
 def _corners(image: np.ndarray, labels: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
-    """Corners (x, y) [n, 2] of hands around a place, within their mask; of a wider place if there are few."""
+    """Corners (x, y) [n, 2] of hands around a pixel, inside their mask; the radius grows if there are few."""
     inside = cv2.erode((labels == HANDS).astype(np.uint8), np.ones((2 * CORNER_EDGE + 1,) * 2, np.uint8))
     for factor in (1.0, 1.6, 2.5):
         around = np.zeros_like(inside)
         cv2.circle(around, tuple(np.round(center).astype(int).tolist()), int(factor * radius), 1, -1)
-        found = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & around, blockSize=3)  # type: ignore[operator]
-        if found is not None and len(found) >= 3 * LEAST_CORNERS:
-            return found.reshape(-1, 2)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found.reshape(-1, 2))
+        corners = cv2.goodFeaturesToTrack(image, CORNERS, 0.003, 2.0, mask=inside & around, blockSize=3)  # type: ignore[operator]
+        if corners is not None and len(corners) >= 3 * LEAST_CORNERS:
+            return corners.reshape(-1, 2)
+    return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners.reshape(-1, 2))
 
 
 def _flow(
     before: np.ndarray, now: np.ndarray, points: np.ndarray, guess: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where points [n, 2] of an image are now, sought around a guess [n, 2], by default where they were; and which are found."""
+    """Present positions of points [n, 2] and whether each is found; `guess` [n, 2]: initial positions, by default `points`."""
     start = np.ascontiguousarray(points, np.float32)
     guess = start.copy() if guess is None else guess.astype(np.float32)
     options = {"winSize": (CORNER_WINDOW, CORNER_WINDOW), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
@@ -199,11 +199,10 @@ def _flow(
 
 
 def _similarity(key: np.ndarray, start: np.ndarray, points: np.ndarray, least: float = LEAST_CORNERS) -> np.ndarray | None:
-    """The pose [4] of the key frame, moved by the similarity from its corners to their present places; None: fewer than `least`
-    agree."""
+    """Pose [4] of the key frame after the similarity of its corners to `points`; None if fewer than `least` agree."""
     if len(start) < least:
         return None
-    # OpenCV's RANSAC begins with the same seed in every call.
+    # Deterministic: OpenCV's RANSAC uses the same seed in each call.
     matrix, agree = cv2.estimateAffinePartial2D(start, points, method=cv2.RANSAC, ransacReprojThreshold=1.5)
     if matrix is None or agree.sum() < least:
         return None
@@ -212,16 +211,19 @@ def _similarity(key: np.ndarray, start: np.ndarray, points: np.ndarray, least: f
 
 
 def place(image: ImageObservations, first: np.ndarray, *, ground: bool = True) -> np.ndarray:
-    """Controllers [T, C, 3], m, from those of frame 0 [C, 3]; `ground`: above a table.
+    """Controllers [T, C, 3], m, from their positions in frame 0 [C, 3]; `ground`: above a table.
 
-    In camera axes, with the grip's point g(t) at depth z(t) on the ray through u(t): x(t) = g(t) + R(a(t)) (x(0) - g(0)), R a turn
-    by the hand's angle a about that ray.
+    In camera axes, with the grasp g(t) at depth z(t) on the ray through u(t):
+
+        x(t) = g(t) + R(a(t)) (x(0) - g(0))
+
+    R rotates by the hand's angle a about that ray.
     """
     pose = image.camera_to_world
     local = (first - pose[:3, 3]) @ pose[:3, :3]
     axis = pose[:3, 2] * [1.0, 1.0, 0.0]
     if np.linalg.norm(axis) < 1e-3:
-        # Straight down: up in the image is the horizontal direction away from the camera.
+        # For a camera that looks straight down, up in the image replaces the viewing direction.
         axis = -pose[:3, 1] * [1.0, 1.0, 0.0]
     depths = plane_depths(image, axis / np.linalg.norm(axis))
     if ground:
@@ -229,21 +231,21 @@ def place(image: ImageObservations, first: np.ndarray, *, ground: bool = True) -
     result = np.empty((len(depths), *local.shape))
     directions = rays(image)
     for hand in range(image.hands):
-        own = np.flatnonzero(image.hand_of == hand)
-        center = directions[0, hand] * local[own, 2].mean()
-        at = directions[:, hand] * (depths[:, hand] * center[2])[:, None]
+        members = np.flatnonzero(image.hand_of == hand)
+        center = directions[0, hand] * local[members, 2].mean()
+        grasp = directions[:, hand] * (depths[:, hand] * center[2])[:, None]
         axes = directions[:, hand] / np.linalg.norm(directions[:, hand], axis=1, keepdims=True)
-        turns = Rotation.from_rotvec(axes * image.hand_angles[:, hand, None].astype(np.float64))
+        rotations = Rotation.from_rotvec(axes * image.hand_angles[:, hand, None].astype(np.float64))
         for frame in range(len(depths)):
-            result[frame, own] = at[frame] + turns[frame].apply(local[own] - center)
+            result[frame, members] = grasp[frame] + rotations[frame].apply(local[members] - center)
     result[0] = local
     return np.asarray(result @ pose[:3, :3].T + pose[:3, 3])
 
 
 def plane_depths(image: ImageObservations, normal: np.ndarray) -> np.ndarray:
-    """Depths [T, H], over those of frame 0, at which grips meet the plane with a normal [3] in the world.
+    """Depths [T, H] relative to frame 0 at which the rays of grasps meet a plane with a normal [3] in the world.
 
-    With rays r(t) and the normal n in camera axes they are (n . r(0)) / (n . r(t)).
+    With rays r(t) and the normal n in camera axes: (n . r(0)) / (n . r(t)).
     """
     along = rays(image) @ (normal @ image.camera_to_world[:3, :3])
     facing = along[0] * along > 0
@@ -252,15 +254,17 @@ def plane_depths(image: ImageObservations, normal: np.ndarray) -> np.ndarray:
 
 
 def rays(image: ImageObservations) -> np.ndarray:
-    """Rays K^-1 [x, y, 1] through the grips [T, H, 3]: points at depth 1 in camera axes."""
+    """Rays K^-1 [x, y, 1] through the grasps [T, H, 3]: points at depth 1 in camera axes."""
     pixels = image.hand_centers.astype(np.float64)
     ones = np.ones((*pixels.shape[:-1], 1))
     return np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(image.intrinsics).T
 
 
 def hands_strip(capture: Capture, image: ImageObservations, controllers: np.ndarray) -> np.ndarray:
-    """Frames of the video with the grip of each hand: its place, turn and size, and where it was; of hands that the capture brings
-    the controllers [T, C, 3], m."""
+    """Draw the position, rotation, size and path of each grasp on frames of the video.
+
+    For hands that the capture contains, draw their controllers [T, C, 3], m.
+    """
     tiles, camera = [], next(iter(capture.cameras))
     for frame in spread(frames_of(capture, camera), STRIP_FRAMES):
         tile = np.ascontiguousarray(capture.color(camera, frame))

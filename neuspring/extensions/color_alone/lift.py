@@ -1,5 +1,5 @@
-"""One color camera without depth: the object of frame 0 on the table (`first_frame`), or at nodes that the capture brings
-(`given`); hands and silhouettes of later frames are evidence in the image."""
+"""Lifter for one color camera without depth: the object in frame 0 from its silhouette (`first_frame`) or from nodes of the
+capture (`given`), and image evidence of hands, tracks and silhouettes in later frames."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from neuspring.perception.controllers import ALWAYS, MOST_CONTROLLERS
 from neuspring.perception.shape import no_prior, shape_prior
 
 GRIP_REACH = 0.02
-"""Distance from the object up to which pixels of a hand hold it in frame 0, m at the object."""
+"""Largest distance of grasping hand pixels from the object in frame 0, m at the object."""
 GRIP_LENGTH = 0.04
-"""Distance from a hand's tip, its pixel farthest along the arm, up to which its pixels hold a sheet, m at the object."""
+"""Largest distance of hand pixels that grasp a sheet from the hand's tip, its pixel farthest along the arm, m at the object."""
 HANDS_APART = 0.04
-"""Distance between the grips of different hands, m at the object."""
+"""Smallest distance between grasps of different hands, m at the object."""
 HAND_RADIUS = 0.08
-"""Corners of a hand are followed this far around its grip, m at the object."""
+"""Radius around a grasp in which corners of the hand are tracked, m at the object."""
 OUTLINE_POINTS = 300
-"""Points of the object's silhouette per frame."""
+"""Number of points of the object's silhouette per frame."""
 DISTANCE_CELL = 4
-"""Side of the cells of the distance from object and hands, pixels."""
+"""Cell size of the distance map of object and hands, pixels."""
 HIDDEN_STRIDE = 3
-"""Stride among the object's pixels beneath hands: each third gets a point."""
+"""Every third object pixel beneath hands gets a point."""
 SeenHands = tuple[dict[str, np.ndarray], list[np.ndarray], dict[str, float]]
-"""Entries of ImageObservations about hands, the pixels of each grip, and facts."""
+"""Entries of ImageObservations about hands, the pixels of each grasp, and facts."""
 
 
 def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, PixelTracks], settings: Perception) -> Lifted:
-    """Object and hands in the world as far as they are known, the shape prior, and the evidence of the image.
+    """Lift object and hands; returns points in the world, the shape prior and the image evidence.
 
-    Nodes that the capture brings take the place of a supposed shape, and there is no prior. Else the prior of ropes and bodies is
-    what lies between their supposed upper and lower side (`FirstFrame`), or a mesh that is placed on the upper side; sheets have
-    none. Raises InputError without object, hands or tracks.
+    Nodes of the capture replace an assumed shape and the prior. Otherwise, the prior of ropes and bodies is the volume between
+    their assumed upper and lower side (`FirstFrame`), or a mesh aligned with the upper side. Sheets have no prior. Raises
+    InputError without object, hands or tracks.
     """
     name, space = next(iter(capture.cameras)), read(capture)
     labels = masks[name].labels
@@ -57,10 +57,10 @@ def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, Pixe
     lifted, image = lift_color(capture, labels, tracks[name], first, space)
     prior, shape = no_prior(), settings.shape
     if not given and not (first.kind == "flat" and shape.backend == "auto"):
-        supposed = Supposed(capture.folder, capture.description, first.depths(1.0))
-        whole = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
-        # Between its upper and its lower side all belongs to the object.
-        prior = shape_prior(supposed, {name: whole}, lifted.cloud, replace(shape, back="none"), first.depths(0.0))
+        assumed = Supposed(capture.folder, capture.description, first.depths(1.0))
+        filled = replace(masks[name], labels=np.where(first.filled, OBJECT, labels[0])[None].astype(np.uint8))
+        # The full volume between the upper and the lower side belongs to the object.
+        prior = shape_prior(assumed, {name: filled}, lifted.cloud, replace(shape, back="none"), first.depths(0.0))
         prior = replace(prior, backend=f"{prior.backend}, {lifted.backend}")
     return Lifted(
         tracks=lifted,
@@ -73,7 +73,7 @@ def lift(capture: Capture, masks: Mapping[str, Masks], tracks: Mapping[str, Pixe
 
 
 def depth_of(camera: Camera, cloud: np.ndarray) -> np.ndarray:
-    """Depth [H, W], m, at the pixels of a cloud [P, 3], m; 0 elsewhere."""
+    """Depth [H, W], m, of a cloud [P, 3], m; 0 at other pixels."""
     pixels, distance = camera.project(cloud.astype(float))
     seen = camera.sees(pixels)
     x, y = np.round(pixels[seen]).astype(int).T
@@ -84,7 +84,7 @@ def depth_of(camera: Camera, cloud: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Supposed(Capture):
-    """A capture whose depth in frame 0 is that of the supposed shape."""
+    """A capture with the depth of the assumed shape in frame 0."""
 
     front: np.ndarray
     """[H, W], m."""
@@ -97,29 +97,29 @@ class Supposed(Capture):
 def lift_color(
     capture: Capture, labels: np.ndarray, tracks: PixelTracks, first: FirstFrame, space: InSpace
 ) -> tuple[LiftedTracks, ImageObservations]:
-    """Tracks and hands in the world as far as they are known, and the evidence in the image.
+    """Tracks and controllers in the world, and the image evidence; labels [T, H, W] are masks.
 
-    labels [T, H, W] are masks. The object's points are known in frame 0; beneath hands some are added that no track has. Hands are
-    those that the capture brings (`space`), or at most MOST_CONTROLLERS points of what is seen. Raises InputError without tracks on
-    the object, or without a hand.
+    World points of the object are known only in frame 0. Object pixels beneath hands get points without tracks. Controllers are
+    those of the capture (`space`), or at most MOST_CONTROLLERS visible hand points. Raises InputError without tracks on the
+    object, or without a hand.
     """
     camera, name, frames = first.camera, first.camera.name, capture.frame_count
     where = f"{capture.folder}, perception"
     start = np.round(tracks.pixels[0]).astype(int)
-    own = labels[0][start[:, 1], start[:, 0]] == OBJECT
-    if not own.any():
-        raise InputError(where, "at least one tracked point must lie on the object in frame 0", "none", "Look at masks and tracks.")
+    tracked = labels[0][start[:, 1], start[:, 0]] == OBJECT
+    if not tracked.any():
+        raise InputError(where, "at least one tracked point must be on the object in frame 0", "none", "Check masks and tracks.")
     hidden = pixels_of(first.filled & (labels[0] != OBJECT))[::HIDDEN_STRIDE].astype(np.float32)
-    pixels = np.concatenate([tracks.pixels[:, own], np.repeat(hidden[None], frames, axis=0)], axis=1)
-    visible = np.concatenate([tracks.visible[:, own], np.zeros((frames, len(hidden)), bool)], axis=1)
-    # Nothing of the object is handed on from future frames, or of repeated images, of which marks are not scored either.
+    pixels = np.concatenate([tracks.pixels[:, tracked], np.repeat(hidden[None], frames, axis=0)], axis=1)
+    visible = np.concatenate([tracks.visible[:, tracked], np.zeros((frames, len(hidden)), bool)], axis=1)
+    # Drops tracks of future frames, and of repeated images, whose annotated points are not scored either.
     new = np.array([capture.shows(name, frame) for frame in range(frames)])
     visible[~new] = visible[capture.train_end :] = False
     pixels = np.where(visible[..., None], pixels, 0.0)
-    places = np.concatenate([tracks.pixels[0, own], hidden])
-    points = np.zeros((frames, len(places), 3))
-    points[0] = first.points(places)
-    known = np.zeros((frames, len(places)), bool)
+    origins = np.concatenate([tracks.pixels[0, tracked], hidden])
+    points = np.zeros((frames, len(origins), 3))
+    points[0] = first.points(origins)
+    known = np.zeros((frames, len(origins)), bool)
     known[0] = True
     unseen: SeenHands = no_seen_hands(frames), [], {}
     seen, chosen, facts = _seen_hands(capture, labels, first, where) if space.hands is None else unseen
@@ -141,9 +141,9 @@ def lift_color(
     else:
         hands = held(space.hands, space.tracks, capture.train_end)
     colors = capture.color(name, 0) / 255.0
-    place_rows, pose = np.round(places).astype(int), capture.description.pose
+    rounded, pose = np.round(origins).astype(int), capture.description.pose
     facts |= {
-        "object_tracks": float(own.sum()),
+        "object_tracks": float(tracked.sum()),
         "hidden_points": float(len(hidden)),
         "visible_share": float(visible[: capture.train_end].mean()),
         "controllers": float(hands.shape[1]),
@@ -155,7 +155,7 @@ def lift_color(
         object_points=points,
         object_visibility=known,
         object_motion_valid=np.zeros_like(known),
-        object_colors=colors[place_rows[:, 1], place_rows[:, 0]],
+        object_colors=colors[rounded[:, 1], rounded[:, 0]],
         controller_points=hands,
         controller_valid=ALWAYS if space.hands is None else space.hands.holds,
         cloud=first.points(pixels_of(first.filled)),
@@ -167,18 +167,18 @@ def lift_color(
 
 
 def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, where: str) -> SeenHands:
-    """Evidence of the hands in the masks. Raises InputError for none."""
-    # A hand above a sheet hides more of it than its fingers hold.
+    """Image evidence of the hands in the masks. Raises InputError without a hand."""
+    # A hand above a sheet hides more of it than its fingers grasp.
     sizes = (GRIP_REACH, HANDS_APART, GRIP_LENGTH if first.kind == "flat" and capture.description.ground else np.inf)
-    if not (found := grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))):
-        remedy = f"Mark the hands in frame 0, or bring them in space ({CONTROLLERS[0]})."
+    if not (grasps := grips(labels[0], first.filled, *(size / first.pixel_size for size in sizes))):
+        remedy = f"Annotate the hands in frame 0, or add them in 3D ({CONTROLLERS[0]})."
         raise InputError(f"{where}, masks of frame 0", "at least one hand must be in view", "none", remedy)
-    motion = follow_hands(capture, first.camera.name, labels, found, HAND_RADIUS / first.pixel_size)
-    chosen = [grip[farthest(grip.astype(float), max(MOST_CONTROLLERS // len(found), 4))] for grip in found]
+    motion = follow_hands(capture, first.camera.name, labels, grasps, HAND_RADIUS / first.pixel_size)
+    chosen = [grip[farthest(grip.astype(float), max(MOST_CONTROLLERS // len(grasps), 4))] for grip in grasps]
     hand_of = np.concatenate([np.full(len(grip), hand) for hand, grip in enumerate(chosen)])
     seen = {"hand_of": hand_of, "hand_centers": motion.centers, "hand_angles": motion.angles, "hand_sizes": motion.sizes}
     facts = {
-        "hands": float(len(found)),
+        "hands": float(len(grasps)),
         "hand_lost_frames": float(motion.lost),
         "smallest_hand": float(motion.sizes.min()),
         "largest_hand": float(motion.sizes.max()),
@@ -187,7 +187,7 @@ def _seen_hands(capture: Capture, labels: np.ndarray, first: FirstFrame, where: 
 
 
 def no_seen_hands(frames: int) -> dict[str, np.ndarray]:
-    """Entries of ImageObservations about hands that the capture brings: none."""
+    """Empty entries of ImageObservations about hands, for controllers of the capture."""
     flat = np.zeros((frames, 0), np.float32)
     return {"hand_of": np.zeros(0, int), "hand_centers": flat[..., None].repeat(2, 2), "hand_angles": flat, "hand_sizes": flat}
 
@@ -201,7 +201,7 @@ def silhouettes(labels: np.ndarray, samples: int = OUTLINE_POINTS) -> dict[str, 
     outside = np.zeros((frames, -(-height // cell), -(-width // cell)), np.float32)
     for frame, label in enumerate(labels):
         if not (label == OBJECT).any():
-            # Out of view: nothing says where it is.
+            # The object is out of view: no evidence.
             continue
         padded = np.pad(away_from(label != NOTHING), ((0, -height % cell), (0, -width % cell)), mode="edge")
         outside[frame] = padded.reshape(outside.shape[1], cell, outside.shape[2], cell).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""Operations on masks [H, W] bool that all of this package needs."""
+"""Operations on masks [H, W] bool for this package."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import numpy as np
 
 
 def away_from(mask: np.ndarray) -> np.ndarray:
-    """Distance of each pixel [H, W] from the nearest one of a mask, pixels."""
+    """Distance of each pixel [H, W] from the nearest mask pixel, pixels."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
 
 
 def core_of(mask: np.ndarray, least: float = 0.0) -> np.ndarray:
-    """The mask without its border; all of it where no more than the part `least` is left: a thin rope has no core."""
+    """The mask without its border; the full mask if at most the fraction `least` remains, as for a thin rope."""
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     return core if core.sum() > least * mask.sum() or not least else mask
 
 
 def disc(radius: int) -> np.ndarray:
-    """A disc [2 radius + 1, 2 radius + 1] to dilate with."""
+    """Disc-shaped kernel [2 radius + 1, 2 radius + 1]."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
 
 

@@ -1,4 +1,4 @@
-"""Evidence of the marks on one frame: what each pixel is, can be, and probably is."""
+"""Evidence of the annotations of one frame: certain, possible and probable labels of each pixel."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from neuspring.extensions.color_alone.pixels import away_from
 from neuspring.perception.marks import FILLED_MARKS, Mark, drawn
 
 UNMARKED_PIXEL = 255
-"""In `Seeds.certain`: no mark says what the pixel is."""
+"""Value in `Seeds.certain` of a pixel without annotation."""
 ODDS_FALL = 0.08
-"""Distance from its marks, as part of the image, by which the odds of a label without bounds fall by e."""
+"""Distance from its annotations at which the odds of an unbounded label fall by e, as a fraction of the image."""
 POLYGON_SLOPE = 0.3
-"""Distance from the border of a polygon, as part of its `radius`, by which the log odds change by 1."""
+"""Distance from the border of a polygon at which the log odds change by 1, as a fraction of its `radius`."""
 MOST_ODDS = 4.0
-"""Largest log odds by place."""
+"""Largest log odds by position."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Evidence of the marks of one frame."""
+    """Evidence of the annotations of one frame."""
 
     certain: np.ndarray
     """[H, W] uint8: the label, or UNMARKED_PIXEL."""
     possible: np.ndarray
-    """[K, H, W] bool: where nothing, object and hands can be; K = 4 with a person."""
+    """[K, H, W] bool: possible pixels of nothing, object and hands; K = 4 with a person."""
     prior: np.ndarray
-    """[K, H, W] float32: log odds that the marks' places alone give; 0 where they say nothing."""
+    """[K, H, W] float32: log odds from the positions of annotations; 0 without evidence."""
 
     @classmethod
     def of(cls, marks: Sequence[Mark], size: tuple[int, int], scale: float, *, carried: bool = False, kinds: int = PERSON) -> Seeds:
-        """Evidence of the marks on one frame, drawn into an image of `size` (height, width) that is `scale` times the camera's.
+        """Draw the annotations of one frame into an image of `size` (height, width), which is `scale` times the camera's image.
 
-        Boxes and polygons bound a label, unless it is also clicked or scribbled outside of them. Hands lie over objects, what is
-        ignored over both, and clicks and scribbles over polygons. With `carried` the place of labels is also known from the frame
-        before: then a label without marks can be anywhere, as a person can. `kinds` is K.
+        Boxes and polygons bound a label, unless clicks or scribbles of the label are outside them. Hands override the object,
+        ignored areas override both, and clicks and scribbles override polygons. With `carried`, the previous frame also locates
+        labels, so that a label without annotations can be anywhere, like a person. `kinds` is K.
         """
         certain, possible = np.full(size, UNMARKED_PIXEL, np.uint8), np.ones((kinds, *size), bool)
         prior = np.zeros((kinds, *size), np.float32)
@@ -51,7 +51,7 @@ class Seeds:
             elif areas and all((line & np.any(areas, axis=0)).any() for line in lines):
                 possible[label] = np.any([*areas, *lines], axis=0)
             elif not carried:
-                # Not bounded: what is far from all marks of a label needs a color that says so.
+                # Not bounded: pixels far from all annotations of a label need evidence of color.
                 far = away_from(np.any([*areas, *lines], axis=0))
                 prior[label] = np.maximum(-far / (ODDS_FALL * max(size)), -MOST_ODDS)
             for mark in own:
@@ -61,7 +61,7 @@ class Seeds:
                     prior[label] = np.maximum(prior[label], np.clip(slope, -MOST_ODDS, MOST_ODDS) * (possible[label]))
         for shapes in (("polygon", "box"), ("scribble", "click")):
             for mark in sorted(marks, key=lambda mark: (OBJECT, HANDS, PERSON, NOTHING).index(mark.value)):
-                # A box of a label says where it can be, not where it is.
+                # A box gives possible pixels of a label, not certain ones.
                 if mark.kind in shapes and (mark.kind != "box" or mark.label in FILLED_MARKS):
                     certain[drawn(mark, size, scale)] = mark.value
         known = certain != UNMARKED_PIXEL
@@ -72,9 +72,9 @@ class Seeds:
 
     @property
     def marked(self) -> np.ndarray:
-        """Pixels [H, W] bool that are certain or inside of a polygon."""
+        """Pixels [H, W] bool that are certain or inside a polygon."""
         return np.asarray((self.certain != UNMARKED_PIXEL) | (self.prior[1:] > 0).any(axis=0))
 
     def part(self, window: tuple[slice, slice]) -> Seeds:
-        """A window of it."""
+        """The evidence in a window of the image."""
         return Seeds(self.certain[window], self.possible[(slice(None), *window)], self.prior[(slice(None), *window)])

@@ -1,10 +1,11 @@
-"""From marks on a few frames to labels of every frame of one camera, and how far each frame is doubted.
+"""Annotations of a few frames -> labels and doubt of all frames of one camera.
 
-Every marked frame is solved from its marks (`start`). From there labels go to the next frame and to the one before: dense flow
-carries their probabilities, and each pixel weighs four things as log likelihoods: where the labels were, the colors of nothing,
-object and hands, the usual color of this pixel of the background, and depth where there is some. A field of labels, in which
-neighbors of one color like to be the same, settles it. Between two marked frames both directions are blended by their distance in
-time. A second pass knows the whole film's background.
+1. Each annotated frame is solved from its annotations (`solve.start`).
+2. From there, dense optical flow carries label probabilities forward and backward. In each frame, every pixel combines four log
+   likelihoods: the carried labels; the colors of nothing, object and hands; its usual background color; and depth, if available.
+   A Potts model, in which neighbors of similar color prefer the same label, gives the result.
+3. A second pass repeats this with the background of the full video. Between two annotated frames, both directions are blended by
+   their distance in time.
 """
 
 from __future__ import annotations
@@ -34,36 +35,39 @@ from neuspring.perception.marks import MARKS, Mark, Marks, require_marks
 from neuspring.perception.segment_opencv import lab_of
 
 DISAGREEMENT, UNSURE_BORDER = 0.35, 0.5
-"""Values of each that make a doubt of 63 %."""
+"""Values of each cue that alone give a doubt of 63 %."""
 CARRY_WIDTH = 848
-"""Width of images, pixels, for which BORDER_MOVES is given."""
+"""Image width to which BORDER_MOVES refers, pixels."""
 BORDER_MOVES = 4.0
-"""Distance of the border from where the flow carries it, pixels, at most."""
+"""Largest distance of a border from its carried position, pixels."""
 BACKGROUND_FRAMES = 60
-"""Number of frames that the background of the whole film is learned from."""
+"""Number of frames from which the background of the full video is learned."""
 LEARNED_APART = 4
-"""Pixels around object and hands that teach no background."""
+"""Margin around object and hands that is not learned as background, pixels."""
 
 
 def cues_of(probability: np.ndarray, other: np.ndarray) -> float:
-    """Doubt about a frame's probabilities [K, h, w], squared: how far its labels are from those it was given otherwise [h, w] (1 -
-    IoU, of object or hands the larger one), and how unsure its borders are, the mean of 2 (1 - p) there."""
+    """Sum of the squared doubt cues of a frame's probabilities [K, h, w], each over its constant.
+
+    - Disagreement with `other` labels [h, w]: 1 - IoU, the larger one of object and hands.
+    - Uncertainty at borders: the mean of 2 (1 - p).
+    """
     labels = probability.argmax(axis=0)
-    apart = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
+    disagreement = max(1 - np.nan_to_num(overlap(labels == label, other == label), nan=1.0) for label in (OBJECT, HANDS))
     shown = np.isin(labels, (OBJECT, HANDS))
     rim = shown & ~core_of(shown)
     unsure = float(2 * (1 - probability.max(axis=0)[rim]).mean()) if rim.any() else 0.0
-    return float((apart / DISAGREEMENT) ** 2 + (unsure / UNSURE_BORDER) ** 2)
+    return float((disagreement / DISAGREEMENT) ** 2 + (unsure / UNSURE_BORDER) ** 2)
 
 
 def require(capture: Capture) -> None:
-    """Raise InputError if marks.json is missing or wrong, or contains no marks of a camera."""
+    """Raise InputError if marks.json is missing or wrong, or contains no annotations of a camera."""
     for camera in capture.cameras:
         _marks_of(capture, camera)
 
 
 def segment(capture: Capture, camera: str) -> np.ndarray:
-    """Labels [T, H, W]. Raises InputError without marks.json, or where it contains no marks of this camera."""
+    """Labels [T, H, W]. Raises InputError without marks.json, or if it contains no annotations of this camera."""
     carried = carry(capture, camera, _marks_of(capture, camera))
     doubtful = np.argsort(-carried.doubt, kind="stable")[:3]
     print(f"camera {camera}: most doubtful frames: " + ", ".join(f"{f} ({carried.doubt[f]:.2f})" for f in doubtful), flush=True)
@@ -75,47 +79,47 @@ def _marks_of(capture: Capture, camera: str) -> tuple[Mark, ...]:
     marks = Marks.load(path)
     marks.require(capture, path)
     if not marks.of(camera):
-        raise InputError(f"{path}, cameras", f"camera {camera} needs marks", sorted(marks.cameras))
+        raise InputError(f"{path}, cameras", f"must contain annotations of camera {camera}", sorted(marks.cameras))
     return marks.of(camera)
 
 
 def outline(capture: Capture, camera: str, frame: int, marks: Sequence[Mark]) -> np.ndarray:
-    """Labels [H, W] uint8 of one frame from the marks on it alone. Raises InputError where no object or hand is marked on it."""
+    """Labels [H, W] uint8 of one frame from its own annotations. Raises InputError without an object or a hand among them."""
     film = CameraFilm(capture, camera)
     index = film.frames.index(frame)
     return frame_mask(film, index, [replace(mark, frame=index) for mark in marks if mark.frame == frame])
 
 
 def carry(capture: Capture, camera: str, marks: Sequence[Mark], progress: Progress | None = None) -> Carried:
-    """Labels [T, H, W] and doubt [T] of all frames of a camera, 0 where it has none, from marks on a few.
+    """Labels [T, H, W] and doubt [T] of all frames of a camera, from annotations of a few; 0 in missing frames.
 
-    Raises InputError where marks do not fit the capture.
+    Raises InputError if annotations do not fit the capture.
     """
     return over_capture(capture, camera, marks, lambda film, own: carry_film(film, own, progress=progress))
 
 
 def carry_film(film: Film, marks: Sequence[Mark], *, scale: float = 1.0, progress: Progress | None = None) -> Carried:
-    """As `carry`, worked out on images of `scale` times the film's size.
+    """Like `carry`, computed on images of `scale` times the video's size.
 
-    Raises InputError where no object is marked, or marks lie outside the images.
+    Raises InputError if no object is annotated, or if annotations are outside the images.
     """
     work = _Work(film, marks, scale, progress)
     if not marks:
-        raise InputError("marks", "an object must be marked in one frame or more", 0, 'Add a mark with "label": "object".')
+        raise InputError("annotations", "an object must be annotated in at least one frame", 0, 'Add one with "label": "object".')
     return work.second_pass(work.first_pass())
 
 
 def frame_mask(film: Film, frame: int, marks: Sequence[Mark]) -> np.ndarray:
-    """As `outline`, of a frame of a film."""
+    """Like `outline`, for a frame of a video."""
     own = [mark for mark in marks if mark.frame == frame]
     if not any(mark.value in (OBJECT, HANDS) for mark in own):
-        raise InputError(f"frame {frame}", "an object or a hand must be marked on it", sorted({mark.label for mark in own}))
+        raise InputError(f"frame {frame}", "an object or a hand must be annotated in it", sorted({mark.label for mark in own}))
     work = _Work(film, own, 1.0, whole=False)
     return work.full_labels(work.start(frame).probability)
 
 
 class _Work:
-    """A film at the size that is worked on, its marks, and what two passes through it have learned."""
+    """A video at working size, its annotations, and the colors and background learned in two passes."""
 
     def __init__(
         self,
@@ -135,7 +139,7 @@ class _Work:
         for mark in marks:
             self.marks.setdefault(mark.frame, []).append(mark)
         self.kinds = PERSON + any(mark.label == "person" for mark in marks)
-        """Number of labels: a person is one where it is marked in any frame."""
+        """Number of labels K: 4 if a person is annotated in any frame, else 3."""
         self.person = self._person() if self.kinds > PERSON else None
         self.starts: dict[int, MarkedFrame] = {}
         self.background = Background.empty(self.size)
@@ -150,11 +154,11 @@ class _Work:
         return lab_of(image)
 
     def seeds(self, frame: int, *, carried: bool = False) -> Seeds:
-        """The marks on a frame, drawn."""
+        """Evidence of the annotations of a frame."""
         return Seeds.of(self.marks[frame], self.size, self.scale, carried=carried, kinds=self.kinds)
 
     def resized(self, values: np.ndarray | None) -> np.ndarray | None:
-        """Depth or heights [h, w], which are not averaged over borders."""
+        """Resize depth or heights to [h, w], without averaging over borders."""
         if values is None or self.scale == 1.0:
             return values
         return cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST)
@@ -167,15 +171,15 @@ class _Work:
         return np.asarray(probability.argmax(axis=0), dtype=np.uint8)
 
     def start(self, frame: int) -> MarkedFrame:
-        """A frame, solved from its marks."""
+        """Solve a frame from its annotations."""
         return start(self.lab(frame), self.seeds(frame), self.resized(self.film.height(frame)), self.background, self.person)
 
     def step(self, walk: Pass, frame: int, seeds: Seeds | None = None) -> np.ndarray:
-        """Probabilities [K, h, w] of a frame, solved from the one beside it."""
+        """Probabilities [K, h, w] of a frame, solved from the neighboring frame."""
         return walk.step(self.lab(frame), self.resized(self.film.depth(frame)), seeds)
 
     def first_pass(self) -> np.ndarray:
-        """Labels [T, h, w], from the first frame with an object marked on; marked frames on the way correct them."""
+        """Labels [T, h, w], carried from the first frame with an annotated object; later annotated frames correct them."""
         begin, count = self.begin, self.film.count
         labels = np.zeros((count, *self.size), np.uint8)
         self.starts[begin] = self.start(begin)
@@ -193,13 +197,13 @@ class _Work:
         return labels
 
     def second_pass(self, first: np.ndarray) -> Carried:
-        """Labels and doubt, now that the whole film's background and the colors of all marked frames are known."""
+        """Labels and doubt, from the background of the full video and the colors of all annotated frames."""
         count = self.film.count
-        # The background of the whole film, from frames where their labels say nothing.
+        # Learns the background of the full video away from labels.
         self.background = Background.empty(self.size)
         for frame in spread(range(count), BACKGROUND_FRAMES):
             self.background.learn(self.lab(frame), apart(first[frame], LEARNED_APART), self.resized(self.film.depth(frame)))
-        # What was uncovered later shows where the object ended at first.
+        # The background that is uncovered later shows the object's border in the first frame.
         self.starts[self.begin] = self.start(self.begin)
         labels, doubt = np.zeros((count, *self.full), np.uint8), np.zeros(count)
         keys = sorted(self.starts)
@@ -212,33 +216,33 @@ class _Work:
                 labels[frame] = self.full_labels(probability)
                 doubt[frame] = cues_of(probability, first[frame])
                 self.tick()
-        # Between two marked frames: both directions, weighed by the distance in time.
+        # Between two annotated frames, blends both directions by their distance in time.
         for left, right in pairwise(keys):
             forward, walk = {}, self.walk_from(left, learns=False)
             for frame in range(left + 1, right):
-                # A byte is enough, and a long film fits into memory.
+                # Bytes, so that a long video fits into memory.
                 forward[frame] = np.round(255 * self.step(walk, frame)).astype(np.uint8)
             walk = self.walk_from(right, learns=False)
             for frame in range(right - 1, left, -1):
                 probability = self.step(walk, frame)
-                there, weight = forward.pop(frame) / np.float32(255), (frame - left) / (right - left)
-                doubt[frame] = cues_of(probability, there.argmax(axis=0))
-                labels[frame] = self.full_labels((1 - weight) * there + weight * probability)
+                earlier, weight = forward.pop(frame) / np.float32(255), (frame - left) / (right - left)
+                doubt[frame] = cues_of(probability, earlier.argmax(axis=0))
+                labels[frame] = self.full_labels((1 - weight) * earlier + weight * probability)
                 self.tick()
         return Carried(labels, doubt_of(labels, doubt))
 
     def _person(self) -> np.ndarray:
-        """Colors [bins] of the person in all frames in which one is marked."""
+        """Histogram [bins] of the person over all frames in which one is annotated."""
         frames = [frame for frame, marks in self.marks.items() if any(mark.label == "person" for mark in marks)]
         return mixed([(1.0, count(bins_of(self.lab(frame)), self.seeds(frame).certain == PERSON)) for frame in frames])
 
     @property
     def begin(self) -> int:
-        """The first frame with an object marked on."""
+        """The first frame with an annotated object."""
         return min(frame for frame, own in self.marks.items() if any(mark.label == "object" for mark in own))
 
     def walk_from(self, key: int, *, learns: bool) -> Pass:
-        """A pass that begins at a marked frame."""
+        """A pass that begins at an annotated frame."""
         return Pass(
             lab=self.lab(key),
             probability=self.starts[key].probability,
@@ -249,13 +253,13 @@ class _Work:
         )
 
     def colors(self) -> tuple[np.ndarray, ...]:
-        """Colors of each label in all marked frames so far, and of the person in all of them."""
+        """Histogram of each label over the annotated frames solved so far; of the person over all annotated frames."""
         counts = [mixed([(1.0, own.counts[label]) for own in self.starts.values()]) for label in range(self.kinds)]
         if self.person is not None:
             counts[PERSON] = mixed([(1.0, counts[PERSON]), (1.0, self.person)])
         return tuple(counts)
 
     def tick(self) -> None:
-        """Tell the progress: the first pass solves all frames but its start, the second one all that are not marked."""
+        """Report progress. The first pass solves all frames except its start, the second one all frames without annotations."""
         self.done += 1
         self.progress(self.done, 2 * self.film.count - 1 - len(self.marks))

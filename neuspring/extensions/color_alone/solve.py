@@ -1,8 +1,8 @@
-"""The mask of one frame: from its marks, or from the frame beside it.
+"""Labels of one frame, from its annotations or from the neighboring frame.
 
-In a marked frame colors and labels are found from each other, in turns, in a field of labels in which neighbors of the same color
-like to be the same (mean field of a Potts model). Another frame gets what the flow brings from the one beside it, and weighs it
-against colors, background and depth in the same field.
+In an annotated frame, labels and their colors are estimated alternately. Labels follow from a Potts model in which neighbors of
+similar color prefer the same label, solved by mean-field iteration. In other frames, optical flow carries the labels of the
+neighboring frame, and the same model combines them with colors, background and depth.
 """
 
 from __future__ import annotations
@@ -27,75 +27,76 @@ from neuspring.extensions.color_alone.seeds import ODDS_FALL, UNMARKED_PIXEL, Se
 from neuspring.perception.film import at_border
 
 SMOOTHNESS = 1.5
-"""Cost of a border between two neighboring pixels of the same color, as a log ratio of probabilities."""
+"""Cost of a border between neighboring pixels of the same color, as a log ratio of probabilities."""
 SOLVER_ROUNDS = 10
 GRID_NEIGHBORS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.7071), (1, -1, 0.7071))
-"""Steps down and right, and weights: the inverse of the distance. The other four neighbors are opposite."""
+"""Steps down and right, and weight (inverse distance) of four neighbors; the other four are opposite."""
 BORDER_REACH = 6
-"""Pixels from a border of labels within which a pixel may change."""
+"""Largest distance from a border of labels at which a pixel may change, pixels."""
 DECIDED = 10.0
-"""Log odds from which no neighbors change a pixel."""
+"""Log odds above which neighbors cannot change a pixel."""
 TURNS = 5
 NEVER = -40.0
-"""Log odds of what marks exclude."""
+"""Log odds of labels that annotations exclude."""
 UNMARKED_PERSON = -2.0
-"""Log odds of a person in a frame in which none is marked."""
+"""Log odds of a person in a frame without an annotated person."""
 BACKGROUND_SHADES = (0.88, 0.76)
-"""Factors that darken the colors of the background near the object: its shadow."""
+"""Factors that darken the background's colors near the object, for its shadow."""
 SHADED = 0.1
 """Weight of each shade."""
 LOCAL_BACKGROUND = 0.8
-"""Probability that the background looks like the background around it."""
+"""Probability that a background pixel matches the background around it."""
 AROUND_SHARE = 0.03
-"""Reach around a pixel, as part of the image."""
+"""Radius of the local background, as a fraction of the image."""
 RISEN_HEIGHT, RISEN_LOGS = 0.012, 2.0
-"""Height above the table, m, from which a pixel is probably object or hand, where marks let it be, and by which log odds."""
+"""Height above the table, m, above which a pixel is probably not background, and the log odds of that."""
 COARSE = 6
-"""Factor by which images are made smaller to be blurred."""
+"""Downscaling factor for blurs."""
 LOCAL_NOISE = 2.0
-"""Least spread of L, a, b."""
+"""Smallest standard deviation of L, a and b in the local background."""
 FEW_VARIANCE = 0.5
-"""Added variance where little of the background is seen."""
+"""Variance added where little background is visible."""
 CERTAIN_WEIGHT = 1.0
-"""Weight of the colors beneath clicks, scribbles and polygons, against those of the whole mask so far."""
+"""Weight of the colors beneath clicks, scribbles and polygons, relative to those of the present mask."""
 COLOR_AT_START, COLOR = 0.6, 0.5
-"""Weights of the log densities of colors, in a marked frame and in one beside it: neighboring pixels are not independent."""
+"""Weights of log densities of colors in annotated and in other frames; below 1 because neighboring pixels are dependent."""
 MOST_COLOR = 6.0
-"""Largest log ratio that a pixel's color counts."""
+"""Largest log ratio from the color of a pixel."""
 ANYWHERE = (0.01, 0.004, 0.015, 0.015)
-"""Probability that a pixel becomes nothing, object, hand or person where the flow carries none: things uncover the table or come
-out of hiding, hands and persons come in. Without it for nothing, the shadow of an object that left stays its part for good."""
+"""Probabilities that a pixel becomes nothing, object, hand or person without carried evidence, by uncovering or by entering the
+image. With 0 for nothing, the shadow of an object that moved away stays object."""
 CHANGED = 12.0
-"""Difference of L, a, b, from which the flow is doubted."""
+"""Difference of L, a, b at which the flow counts as wrong."""
 MOST_HOLE, FILLED = 0.2, 2.0
-"""Largest hole that is filled, as part of what is nothing, and the mean log ratio of color from which it is. From 0 on, the table
-between a toy and hands was filled too."""
+"""Largest filled hole, as a fraction of all background pixels, and smallest mean log ratio of its colors. A log ratio of 0 also
+fills the table between a toy and hands."""
 CONFIDENT = 0.95
-"""Probability from which a pixel teaches colors."""
+"""Probability above which colors are learned from a pixel."""
 LEARN, LEARN_EVERY = 0.2, 4
-"""Weight of a frame in the running colors, which are learned from each fourth frame."""
+"""Weight of a frame in the running colors, and interval of these updates, frames."""
 TRUST_START = 0.75
-"""Weight of the marked frames' colors, against the running ones."""
+"""Weight of the annotated frames' colors, relative to the running ones."""
 MARKED_WEIGHT = 0.5
-"""Weight of the colors beneath the marks of a frame on the way, against those of the frames before."""
+"""Weight of the colors beneath the annotations of a later frame, relative to earlier annotated frames."""
 CORRECTION, CORRECTED = 6.0, 5.0
-"""Log odds beside a mark that contradicts what was carried, and how far it reaches, as a multiple of `reach`."""
+"""Log odds at an annotation that contradicts carried labels, and its range as a multiple of `reach`."""
 MOVES_AT_MOST = 12.0
-"""Largest motion of things in a frame, as a multiple of `reach`: the margin of the part of the image that is worked on."""
+"""Largest motion between frames, as a multiple of `reach`: the margin of the solved window."""
 LEAST_SIDE = 64
-"""Smallest side of images between which flow is sought, pixels; smaller ones are continued."""
+"""Smallest side of images for optical flow, pixels; smaller ones are padded."""
 BROUGHT_FROM = 0.2
-"""Probability by place from which a piece counts as brought by the flow."""
+"""Carried probability above which a pixel supports its component."""
 LEAST_ENTERING = 0.0005
-"""Smallest part of the image that a hand covers when it comes in."""
+"""Smallest area of a hand that enters the image, as a fraction of the image."""
 
 
 def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> np.ndarray:
-    """Probabilities [K, H, W] of labels from log likelihoods [K, H, W] and an image [H, W, 3].
+    """Label probabilities [K, H, W] from log likelihoods u [K, H, W] and an image c [H, W, 3], by mean-field iteration:
 
-    q_l(p) ~ exp(u_l(p) + sum_n w_pn q_l(n)),   w_pn = s exp(-|c_p - c_n|^2 / (2 m)) / |p - n|
+        q_l(p) ~ exp(u_l(p) + sum_n w_pn q_l(n)),   w_pn = s exp(-|c_p - c_n|^2 / (2 m)) / |p - n|
 
-    over the eight neighbors n, m the mean of |c_p - c_n|^2, s = `smoothness`. Only pixels near a border of labels are solved.
+    n are the eight neighbors of p, m is the mean of |c_p - c_n|^2, and s is `smoothness`. Only pixels near a border of labels
+    change.
     """
     kinds, height, width = logs.shape
     q = _softmax(logs).reshape(kinds, -1)
@@ -119,14 +120,14 @@ def solve(logs: np.ndarray, lab: np.ndarray, smoothness: float = SMOOTHNESS) -> 
         message = flat.copy()
         for place, link in zip(beside, links, strict=True):
             message += link * q[:, place]
-        # Half a step: without it, two pixels can exchange their labels forever.
+        # The damping prevents two pixels from exchanging their labels forever.
         part = 0.5 * (part + _softmax(message))
         q[:, pixels] = part
     return q.reshape(logs.shape)
 
 
 def _open(logs: np.ndarray) -> np.ndarray:
-    """Which pixels [H, W] are near a border of labels and not decided."""
+    """True for pixels [H, W] near a border of labels that are not decided."""
     best = logs.argmax(axis=0).astype(np.uint8)
     kernel = np.ones((3, 3), np.uint8)
     border = (cv2.dilate(best, kernel) != cv2.erode(best, kernel)).astype(np.uint8)
@@ -143,16 +144,16 @@ def _softmax(logs: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MarkedFrame:
-    """A marked frame that is solved."""
+    """Solution of an annotated frame."""
 
     probability: np.ndarray
-    """[K, H, W] float32; K = 4 where a person is marked in the film, else 3."""
+    """[K, H, W] float32; K = 4 if a person is annotated in the video, else 3."""
     counts: tuple[np.ndarray, ...]
-    """Counts of the colors of nothing, object, hands and person, [bins] each."""
+    """Histograms [bins] of nothing, object, hands and person."""
 
     @classmethod
     def of(cls, lab: np.ndarray, probability: np.ndarray, seeds: Seeds) -> MarkedFrame:
-        """From probabilities that are known: counts the colors."""
+        """Make it from known probabilities."""
         labels = probability.argmax(axis=0).astype(np.uint8)
         return cls(probability, tuple(counts_of(lab, bins_of(lab), labels, seeds)))
 
@@ -169,8 +170,10 @@ def start(
     background: Background,
     person: np.ndarray | None,
 ) -> MarkedFrame:
-    """Labels and colors of a frame, Lab [H, W, 3], from its marks; with heights above the table [H, W], m, the background, and the
-    colors [bins] of a person that is marked in any frame."""
+    """Solve an annotated frame, Lab [H, W, 3], from the evidence of its annotations.
+
+    `height` [H, W], m: heights above the table. `person` [bins]: histogram of a person that is annotated in any frame.
+    """
     bins, labels = bins_of(lab), _first(lab, seeds)
     place = np.where(seeds.possible, seeds.prior, NEVER).astype(np.float32)
     if person is not None and not (seeds.certain == PERSON).any():
@@ -193,7 +196,7 @@ def start(
 
 
 def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, seeds: Seeds) -> list[np.ndarray]:
-    """Colors [bins] of each label: of a mask [H, W], of what is certain, and of shadows on the background."""
+    """Histogram [bins] of each label, from labels [H, W], certain pixels, and shadows on the background."""
     counts = []
     for label in range(len(seeds.possible)):
         own = labels == label
@@ -212,9 +215,9 @@ def counts_of(lab: np.ndarray, bins: np.ndarray, labels: np.ndarray, seeds: Seed
 
 
 def _local_density(lab: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Log density [H, W] of a pixel's color, if it is like the background around it: normal, with the mean and spread there.
+    """Log density [H, W] of each pixel's color under a normal density with mean and spread of the background `rest` around it.
 
-    A table is lit unevenly: as a whole it has the colors of a white toy, and beside the toy it has not.
+    Globally, an unevenly lit table matches a white toy's colors; locally it does not.
     """
     width, image = AROUND_SHARE * max(rest.shape), lab.astype(np.float32)
     weight = rest.astype(np.float32)[..., None]
@@ -231,7 +234,7 @@ def _local_density(lab: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
-    """Labels to begin with: what is certain or in polygons, and in boxes what has other colors than lie outside of them."""
+    """Initial labels: certain pixels and polygons, and pixels in boxes whose colors do not occur outside the boxes."""
     bins, labels = bins_of(lab), np.zeros(lab.shape[:2], np.uint8)
     free = seeds.certain == UNMARKED_PIXEL
     outside = ~seeds.possible[OBJECT] & ~seeds.possible[HANDS]
@@ -253,7 +256,7 @@ def _first(lab: np.ndarray, seeds: Seeds) -> np.ndarray:
 
 
 def tidy(labels: np.ndarray, seeds: Seeds) -> np.ndarray:
-    """Pieces that no mark touches and that are small against the largest are nothing."""
+    """Remove components without annotations that are small relative to the largest one."""
     result = labels.copy()
     for label in range(OBJECT, len(seeds.possible)):
         number, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels == label).astype(np.uint8))
@@ -263,7 +266,7 @@ def tidy(labels: np.ndarray, seeds: Seeds) -> np.ndarray:
         areas[0] = 0
         touched = np.zeros(number, bool)
         touched[np.unique(pieces[(seeds.certain == label) | (seeds.prior[label] > 0)])] = True
-        # A box says that its pieces belong together.
+        # In a box, small components probably belong to the label.
         bounded = seeds.possible[label].mean() < 0.5
         drop = ~touched & (areas < (0.02 if bounded else 0.2) * areas.max())
         drop[0] = False
@@ -273,23 +276,23 @@ def tidy(labels: np.ndarray, seeds: Seeds) -> np.ndarray:
 
 @dataclass(eq=False, kw_only=True)
 class Pass:
-    """State while labels are carried in one direction."""
+    """State of carrying labels in one direction."""
 
     lab: np.ndarray
-    """The last frame, Lab [H, W, 3]."""
+    """Previous frame, Lab [H, W, 3]."""
     probability: np.ndarray
-    """Probabilities of the last frame [K, H, W]."""
+    """Probabilities of the previous frame [K, H, W]."""
     first: tuple[np.ndarray, ...]
-    """Colors of the marked frames: counts [bins] of nothing, object, hands, person."""
+    """Histograms [bins] of nothing, object, hands and person in the annotated frames."""
     background: Background
     learns: bool
-    """True where the background is learned on the way."""
+    """True if the pass also learns the background."""
     reach: float
     running: list[np.ndarray] = field(init=False)
     colors: list[np.ndarray] = field(init=False)
     """Log densities [bins] of each label."""
     explained: np.ndarray = field(init=False)
-    """[H, W] bool: where the background explains the last frame's colors best."""
+    """[H, W] bool: the background explains the previous frame's color best."""
     steps: int = 0
 
     def __post_init__(self) -> None:
@@ -298,7 +301,7 @@ class Pass:
         self._learn(None)
 
     def step(self, lab: np.ndarray, depth: np.ndarray | None = None, seeds: Seeds | None = None) -> np.ndarray:
-        """Probabilities [K, H, W] of the next frame, Lab [H, W, 3], which becomes the last one; with its depth, m, and marks."""
+        """Probabilities [K, H, W] of the next frame, Lab [H, W, 3], with its depth, m, and annotations; advances the state."""
         window = self.window(lab, seeds)
         near, before = lab[window], self.probability[(slice(None), *window)]
         place = self.place(near, self.lab[window], before)
@@ -322,7 +325,7 @@ class Pass:
         return self.probability
 
     def window(self, lab: np.ndarray, seeds: Seeds | None) -> tuple[slice, slice]:
-        """The part of the image that is worked on: around what was there, what comes in from the border, and marks."""
+        """Window of the image to solve: previous labels, changes that enter at the border, and annotations, with a margin."""
         busy = self.probability[NOTHING] < 0.9
         if seeds is not None:
             busy |= seeds.marked
@@ -330,14 +333,14 @@ class Pass:
                 return slice(None), slice(None)
         busy |= _entering(self.background.changed(lab))
         margin = round(MOVES_AT_MOST * self.reach)
-        places = []
+        sides = []
         for axis in (1, 0):
-            found = np.flatnonzero(busy.any(axis=axis))
-            places.append(slice(max(found[0] - margin, 0), found[-1] + margin + 1) if len(found) else slice(None))
-        return places[0], places[1]
+            used = np.flatnonzero(busy.any(axis=axis))
+            sides.append(slice(max(used[0] - margin, 0), used[-1] + margin + 1) if len(used) else slice(None))
+        return sides[0], sides[1]
 
     def place(self, lab: np.ndarray, last: np.ndarray, probability: np.ndarray) -> np.ndarray:
-        """Probabilities [K, h, w] by what the flow brings."""
+        """Probabilities [K, h, w] carried by the optical flow."""
         flow = flow_between(lab[..., 0], last[..., 0])
         height, width = lab.shape[:2]
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
@@ -359,11 +362,11 @@ class Pass:
         return np.asarray(place / place.sum(axis=0))
 
     def _new(self, seeds: Seeds) -> list[int]:
-        """Labels that are marked on a frame and were on none before."""
+        """Labels that are annotated for the first time."""
         return [label for label in range(OBJECT, len(self.first)) if not self.first[label].any() and (seeds.certain == label).any()]
 
     def _show(self, lab: np.ndarray, seeds: Seeds) -> None:
-        """Take the colors beneath the marks of a frame at once: they say what was not known before."""
+        """Learn the colors beneath the annotations of a frame before it is solved."""
         bins = bins_of(lab)
         for label in range(len(self.first)):
             if (shown := count(bins, seeds.certain == label)).any():
@@ -372,7 +375,7 @@ class Pass:
     def color_logs(
         self, lab: np.ndarray, probability: np.ndarray, window: tuple[slice, slice], depth: np.ndarray | None
     ) -> np.ndarray:
-        """Weighted log densities [K, h, w] of a frame's colors, and of its depth against the background's."""
+        """Weighted log densities [K, h, w] of a frame's colors, and of its depth relative to the background."""
         bins = bins_of(lab)
         logs = np.stack([own[bins] for own in self.colors])
         nearer = np.zeros(lab.shape[:2], np.float32)
@@ -381,7 +384,7 @@ class Pass:
         logs[NOTHING] = background.explain(logs[NOTHING], lab, gain)
         if depth is not None:
             nearer = background.depth_log_ratio(depth)
-        # What the background explains teaches no color of the object: its shadow would become a part of it.
+        # Colors that the background explains are not learned for the object, or its shadow would become object.
         self.explained = np.zeros(self.lab.shape[:2], bool)
         self.explained[window] = logs[NOTHING] > logs[1:].max(axis=0)
         logs = COLOR * np.maximum(logs - logs.max(axis=0), -MOST_COLOR / COLOR)
@@ -389,8 +392,7 @@ class Pass:
         return np.asarray(logs, dtype=np.float32)
 
     def tidy(self, probability: np.ndarray, place: np.ndarray, window: tuple[slice, slice], seeds: Seeds | None) -> np.ndarray:
-        """Pieces that nothing brought are nothing, unless they are marked; hands and persons may come in from the
-        image's border."""
+        """Remove components without carried support or annotation, except hands and persons that enter at the image border."""
         labels = probability.argmax(axis=0)
         rows, columns = self.lab.shape[:2]
         for label in range(OBJECT, len(probability)):
@@ -408,14 +410,14 @@ class Pass:
         return probability
 
     def fill(self, probability: np.ndarray, lab: np.ndarray, window: tuple[slice, slice]) -> None:
-        """Holes in object and hands are object where no background was ever seen, unless they look like the background around.
+        """Fill holes in object and hands where the background was never seen, unless they match the background around them.
 
-        What a hand uncovers of a cloth has colors that no mark knows, such as those of folds.
+        A hand can uncover parts of a cloth with unknown colors, such as folds.
         """
         nothing, seen = probability.argmax(axis=0) == NOTHING, self.background.part(window).seen > 0
         number, pieces, boxes, _ = cv2.connectedComponentsWithStats(nothing.astype(np.uint8), connectivity=4)
         areas = boxes[:, cv2.CC_STAT_AREA]
-        # The piece 0 is what is not nothing.
+        # Component 0 contains all labeled pixels.
         holes = ~at_border(boxes, nothing.shape) & (np.arange(number) > 0) & (areas < MOST_HOLE * nothing.sum())
         if (unseen := holes[pieces] & ~seen).any():
             ratio = self.colors[OBJECT][bins_of(lab)] - _local_density(lab, nothing & seen)
@@ -425,11 +427,11 @@ class Pass:
             probability[:, holes[pieces]] = self._nearly(OBJECT)
 
     def _nearly(self, label: int) -> np.ndarray:
-        """Probabilities [K, 1] of a pixel that is surely of a label."""
+        """Probabilities [K, 1] of a pixel with a certain label."""
         return np.where(np.arange(len(self.first)) == label, 0.98, 0.01).astype(np.float32)[:, None]
 
     def _learn(self, depth: np.ndarray | None) -> None:
-        """Colors, from each fourth frame, and the background."""
+        """Learn colors from every fourth frame, and the background."""
         if self.learns:
             labels = self.probability.argmax(axis=0)
             self.background.learn(self.lab, apart(labels, 3) & (self.probability[NOTHING] > CONFIDENT), depth)
@@ -448,7 +450,7 @@ class Pass:
 
 
 def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
-    """Log odds [K, h, w] of marks on a frame to which labels were carried: what contradicts them there fades with the distance."""
+    """Log odds [K, h, w] of annotations in a frame with carried labels; corrections fade with the distance."""
     logs = np.where(seeds.possible, seeds.prior, NEVER)
     carried = place.argmax(axis=0)
     for label in range(len(logs)):
@@ -458,19 +460,19 @@ def corrections(place: np.ndarray, seeds: Seeds, reach: float) -> np.ndarray:
 
 
 def flow_between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Flow [H, W, 2], pixels: where in image `there` each pixel of `here` is (gray [H, W] uint8)."""
+    """Optical flow [H, W, 2] from image `here` to image `there`, pixels; both are gray [H, W] uint8."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     height, width = here.shape
-    # Its pyramid is chosen by the longer side; a strip would vanish on the way up, which OpenCV does not survive.
+    # The longer side determines the pyramid. A narrow strip would shrink to nothing, which crashes OpenCV.
     least = max(LEAST_SIDE, max(height, width) // 2)
-    beside = (0, max(least - height, 0), 0, max(least - width, 0))
-    wide = [np.asarray(cv2.copyMakeBorder(image, *beside, cv2.BORDER_REPLICATE)) for image in (here, there)]
-    flow = method.calc(wide[0], wide[1], np.zeros((*wide[0].shape, 2), np.float32))
+    margins = (0, max(least - height, 0), 0, max(least - width, 0))
+    padded = [np.asarray(cv2.copyMakeBorder(image, *margins, cv2.BORDER_REPLICATE)) for image in (here, there)]
+    flow = method.calc(padded[0], padded[1], np.zeros((*padded[0].shape, 2), np.float32))
     return np.asarray(flow)[:height, :width]
 
 
 def _entering(changed: np.ndarray) -> np.ndarray:
-    """Pieces of what changed [H, W] bool that reach the border of the image and are not small."""
+    """Components of changed pixels [H, W] bool that touch the image border and are not small."""
     opened = cv2.morphologyEx(changed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, pieces, boxes, _ = cv2.connectedComponentsWithStats(opened)
     keep = at_border(boxes, changed.shape) & (boxes[:, cv2.CC_STAT_AREA] > LEAST_ENTERING * changed.size)

@@ -1,7 +1,7 @@
-"""A twin in the formats of other tools. README.md here is the page for users.
+"""Twins in the formats of other tools. The page for users is README.md.
 
-A format is a file of `formats/` with its `export`; an installed package brings one by an entry point of `neuspring.exports`.
-`source` is the run or twin that is exported, `newton_twin` the script that is exported.
+Each module of `formats/` defines one format in its variable `export`. An installed package adds formats by entry points of the
+group `neuspring.exports`. `source` reads the run or twin; `newton_twin` is a script that the format `newton` copies.
 """
 
 from __future__ import annotations
@@ -19,27 +19,29 @@ from neuspring.twin.body import body_of
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """A format that twins are written in."""
+    """A format for twins."""
 
     write: Callable[..., list[Path]]
-    """(source, frames, output) -> paths written."""
+    """(source, frames, output) -> paths of the written files."""
     frames: str = ""
-    """Frames by default, as `--frames` takes them; empty: all."""
+    """Default of `--frames`; empty: all frames."""
     name: str = "{name}"
-    """File or folder by default; {name} is that of the run."""
+    """Default file or folder; {name} is the name of the run."""
+    then: str = "Next: open {output}"
+    """The user's next move, which the command prints at its end; {output} is the file or folder."""
 
 
 BODY_EXPORTS: Registry[Callable[..., Any]] = Registry("body_exports", {})
-"""BODY.FORMAT -> function that writes a body other than the lattice, from entry points of the group `neuspring.body_exports`."""
+"""BODY.FORMAT -> function that writes a body other than the lattice; entry points of the group `neuspring.body_exports`."""
 
 
 def of_body(twin: Twin, format: str) -> Callable[..., Any] | None:
-    """The function that writes the body of a twin in a format; None for a lattice. Raises InputError where there is none."""
+    """The function that writes the body of a twin in a format; None for a lattice. Raises InputError if the format has none."""
     body = body_of(twin).name
     if twin.body is None:
         return None
     if f"{body}.{format}" not in BODY_EXPORTS:
-        raise InputError(f"--to {format}", "the twin must be a lattice", body, "Take --to npz.")
+        raise InputError(f"--to {format}", "the twin must be a lattice", body, "Use --to npz.")
     return BODY_EXPORTS[f"{body}.{format}"]
 
 

@@ -11,13 +11,13 @@ from neuspring.extensions.exports import EXPORTS
 
 
 def export(
-    twin: Annotated[Positional[Path], arg(help="a run's folder, results/<scenario>/<method>/<seed>, or a twin.npz")],
+    twin: Annotated[Positional[Path], arg(help="folder of a run, results/<scenario>/<method>/<seed>, or a twin.npz")],
     to: Annotated[str, arg(help=f"format: {', '.join(EXPORTS)}")],
-    output: Annotated[Path | None, arg(help="file or folder to write; by default it is named after the run")] = None,
-    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; all by default, or 0 for ply")] = None,
-    mass: Annotated[float | None, arg(help="kg in all, which masses and forces get; by default as capture.json says")] = None,
+    output: Annotated[Path | None, arg(help="file or folder to write; default: in export/, with the name of the run")] = None,
+    frames: Annotated[str | None, arg(help="FIRST, FIRST:STOP or FIRST:STOP:STEP; default: all, for ply 0")] = None,
+    mass: Annotated[float | None, arg(help="total mass, kg; scales masses and forces; default: mass in capture.json")] = None,
 ) -> None:
-    """A twin -> a file of another tool, by format."""
+    """Write a twin in the format of another tool."""
     from neuspring.extensions.exports.source import chosen_frames, read_source
 
     if to not in EXPORTS:
@@ -27,4 +27,4 @@ def export(
     target = output or Path("export") / format.name.format(name=source.name)
     for path in format.write(source, chosen_frames(frames, source, format.frames), target):
         print(f"Wrote {path}")
-    print(f"Mass: {source.weight}")
+    print(f"Mass: {source.weight}\n{format.then.format(output=target)}")

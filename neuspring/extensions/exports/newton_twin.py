@@ -1,10 +1,10 @@
-"""An exported twin as a model of Newton 1.8. This file is complete: it needs NumPy, Newton and Warp, and the files beside it.
+"""An exported twin as a model of Newton 1.8. Requires NumPy, Newton, Warp, and the other files of the exported folder.
 
     model = build("my_twin").finalize()         # particles (nodes, then controllers) and springs
     positions = simulate("my_twin", frames=10)  # [11, N, 3], m
 
-Newton's spring has the force ke (l - l0) + kd dl/dt, so ke = stiffness / rest length and kd = dashpot. Its particles have no drag:
-`simulate` slows them after each step. Ground and collisions between nodes are left out.
+Newton's spring has the force ke (l - l0) + kd dl/dt, so ke = stiffness / rest length and kd = dashpot. Newton's particles have no
+drag, so `simulate` slows them after each step. Ground and collisions between nodes are omitted.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ import numpy as np
 
 def load(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and settings of an exported twin."""
-    said = json.loads((Path(folder) / "description.json").read_text())
-    if (said["format"], said["version"]) != ("neuspring-plain", 1):
-        raise ValueError(f"{folder}: format neuspring-plain 1 is required, received {said['format']} {said['version']}")
+    about = json.loads((Path(folder) / "description.json").read_text())
+    if (about["format"], about["version"]) != ("neuspring-plain", 1):
+        raise ValueError(f"{folder}: the format must be neuspring-plain 1; received {about['format']} {about['version']}.")
     with np.load(Path(folder) / "arrays.npz") as stored:
         arrays = {key: stored[key] for key in stored.files}
-    return arrays, {name: entry["value"] for name, entry in said["settings"].items()}
+    return arrays, {name: entry["value"] for name, entry in about["settings"].items()}
 
 
 def build(folder: str | Path) -> newton.ModelBuilder:
-    """Nodes as particles, controllers as particles that do not move by themselves, and springs."""
+    """Nodes as particles, controllers as particles that no force moves, and springs."""
     arrays, settings = load(folder)
     down = (0.0, 0.0, -settings["gravity"] * settings["up_sign"])
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=down)
-    for place, velocity, mass in zip(arrays["nodes"], arrays["velocity"], arrays["mass"], strict=True):
-        builder.add_particle(place.tolist(), velocity.tolist(), float(mass), radius=1e-4)
-    for place in arrays["controllers"]:
-        builder.add_particle(place.tolist(), (0.0, 0.0, 0.0), 0.0, radius=1e-4, flags=0)
+    for position, velocity, mass in zip(arrays["nodes"], arrays["velocity"], arrays["mass"], strict=True):
+        builder.add_particle(position.tolist(), velocity.tolist(), float(mass), radius=1e-4)
+    for position in arrays["controllers"]:
+        builder.add_particle(position.tolist(), (0.0, 0.0, 0.0), 0.0, radius=1e-4, flags=0)
     for (i, j), stiffness, length, dashpot in zip(
         arrays["springs"], arrays["stiffness"], arrays["rest_lengths"], arrays["dashpot"], strict=True
     ):
@@ -46,14 +46,14 @@ def build(folder: str | Path) -> newton.ModelBuilder:
 
 
 def simulate(folder: str | Path, frames: int, drag: bool = True, device: str = "cpu") -> np.ndarray:
-    """Positions of nodes [frames + 1, N, 3], m, with SolverSemiImplicit and the twin's own time step, from frame 0.
+    """Positions of nodes [frames + 1, N, 3], m, from frame 0 on, by SolverSemiImplicit with the twin's time step.
 
-    The hands move as exported, and stay where their last frame is.
+    The controllers move as exported and keep their last position.
     """
     arrays, settings = load(folder)
     count = len(arrays["nodes"])
     model = build(folder).finalize(device=device)
-    model.particle_grid = None  # Else particles push each other away.
+    model.particle_grid = None  # Otherwise particles repel each other.
     solver: Any = newton.solvers.SolverSemiImplicit(model)
     now: Any = model.state()
     then: Any = model.state()

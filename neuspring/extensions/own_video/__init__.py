@@ -1,1 +1,1 @@
-"""A twin of a user's own film with one command, which chains those of the tutorial (neuspring/perception/README.md)."""
+"""A twin of a user's own video with one command: `neuspring twin` (README.md)."""

@@ -1,4 +1,4 @@
-"""The chain of commands from a film to its twin: each a process whose output is shown and logged, passed over where it was done."""
+"""Chain of commands from a video to its twin: each is a process with shown and logged output, skipped if it is done."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ from neuspring.extensions.own_video.options import Wish
 StepRun = Callable[[list[str], Path], int]
 TWIN_STEPS = ("capture", "masks", "check", "twin")
 STEPS_DONE = "steps.json"
-"""Step -> its command, once it has succeeded; `window`: the frames that were chosen; `options`: those of finished steps."""
+"""Step -> command of each finished step; `window`: the chosen frames; `options`: options of finished steps."""
 STEP_OPTIONS = {
     "capture": ("film", "category", "mass", "frames", "intake"),
     "masks": ("masks", "hands", "marks"),
     "twin": ("effort", "method"),
 }
-"""Step -> options of `neuspring twin` that decide what it makes."""
+"""Step -> options of `neuspring twin` that determine its result."""
 PROPOSED = re.compile(r"--frames (\d+-\d+)")
-"""The longest constant grip, which `check-data` proposes first."""
+"""The longest constant grasp, which `check-data` proposes first."""
 WINDOW = re.compile(r"all|\d+-\d+")
 MOVIE_ENDINGS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 LOOK_FOR_MASKS, GRACE = 0.5, 2.0
-"""s between two looks whether masks were saved, and until the page that saved them ends."""
+"""s: interval of the checks for saved masks, and delay before the page is stopped."""
 JOINED: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"}
 BESIDE = "static"
-"""The row that learns nothing, whose errors stand beside the twin's."""
+"""Baseline without learning, for comparison with the twin's errors."""
 
 
 class StepFailed(Exception):
-    """A step ended without success; the argument is its exit status."""
+    """A step failed; the argument is its exit status."""
 
 
 class TwinChain:
-    """The steps of one wish. Raises InputError for what cannot be, before anything is run or written."""
+    """The steps for one set of options. Raises InputError for invalid options before anything runs or is written."""
 
     def __init__(self, wish: Wish) -> None:
         film = wish.film
         if not film.exists():
-            raise InputError(film, "a folder of color and depth, a recording, a video or a capture is required", "nothing there")
+            raise InputError(film, "must be a folder of color and depth, a recording, a video or a capture", "no such path")
         name = re.sub(r"[^A-Za-z0-9_.-]+", "_", film.resolve().stem if film.is_file() else film.resolve().name).strip("._-")
         self.folder = (wish.output or Path("twins") / name).resolve()
         record = self.folder / STEPS_DONE
@@ -71,33 +71,33 @@ class TwinChain:
         _require_window("--window", wish.window or "all")
         for path in (*wish.masks, *wish.hands, *filter(None, [wish.marks])):
             if not path.exists():
-                raise InputError(path, "what --masks, --hands and --marks name must exist", "nothing there")
+                raise InputError(path, "paths of --masks, --hands and --marks must exist", "no such path")
         self.given = (film / CAPTURE).is_file()
         if self.given and any((wish.mass, wish.frames, wish.intake)):
-            rule = "--mass, --frames and --intake make a capture, and this is one"
-            raise InputError(film, rule, CAPTURE, f'Write "mass" into {CAPTURE}; keep frames with --window.')
+            rule = "--mass, --frames and --intake must not be combined with a finished capture"
+            raise InputError(film, rule, CAPTURE, f'Set "mass" in {CAPTURE}, and select frames with --window.')
         self.capture = film.resolve() if self.given else self.folder / "captures" / self.folder.name
         self.method = wish.method or str(read_yaml(workflow_folder() / "config" / "data" / "own.yaml")["methods"][-1])
 
     def _with_earlier_options(self, wish: Wish) -> Wish:
-        """Options that are not given are those of the earlier call. Raises InputError where a capture was made with others."""
+        """Complete the options by those of the earlier call. Raises InputError if they contradict the existing capture."""
         earlier = TypeAdapter(Wish).validate_python({"film": wish.film, **self.done.get("options", {})})
-        changed = {one.name for one in fields(Wish) if getattr(wish, one.name) not in (one.default, getattr(earlier, one.name))}
+        changed = {opt.name for opt in fields(Wish) if getattr(wish, opt.name) not in (opt.default, getattr(earlier, opt.name))}
         taken = {
             name: getattr(earlier, name)
             for name in self.done.get("options", {})
             if name not in changed and getattr(wish, name) != getattr(earlier, name)
         }
         if taken:
-            print("Options of the earlier call: " + ", ".join(_option(*one) for one in taken.items()))
+            print("Options of the earlier call: " + ", ".join(_option(*option) for option in taken.items()))
         if "capture" in self.done and (other := [name for name in STEP_OPTIONS["capture"] if name in changed]):
-            was, now = (", ".join(_option(name, getattr(one, name)) for name in other) for one in (earlier, wish))
-            remedy = "Leave these options out, choose another --output, or delete this folder."
-            raise InputError(self.folder, f"its capture was made with {was}", now, remedy)
+            was, now = (", ".join(_option(name, getattr(options, name)) for name in other) for options in (earlier, wish))
+            remedy = "Omit these options, choose another --output, or delete this folder."
+            raise InputError(self.folder, f"options must match the existing capture, made with {was}", now, remedy)
         return replace(wish, **taken)
 
     def run(self) -> int:
-        """Do what is not done yet; returns the exit status."""
+        """Run the steps that are not done; returns the exit status."""
         try:
             if not self.given:
                 self._make_capture()
@@ -125,20 +125,20 @@ class TwinChain:
             words += [name, *map(str, paths)] if paths else []
         command = _neuspring("mask", str(self.capture), *words)
         if words:
-            # The words behind `python -m neuspring`: the same step in another environment is the same step.
+            # Compares the words after `python -m neuspring`, so that another environment does not repeat the step.
             self._step("masks", command, self._masked() and self.done.get("masks", [])[3:] == command[3:])
         elif self._masked():
-            self._say("masks", "they are in the capture")
+            self._say("masks", "exist in the capture")
         else:
-            place = ["--no-open"] if wish.no_browser else []
-            self._step("masks", _neuspring("annotate", str(self.capture), *place), run=self._annotate)
+            options = ["--no-open"] if wish.no_browser else []
+            self._step("masks", _neuspring("annotate", str(self.capture), *options), run=self._annotate)
 
     def _masked(self) -> bool:
         return (self.capture / CAPTURE).is_file() and read_description(self.capture / CAPTURE).masks
 
     def _annotate(self, command: list[str], log: Path) -> int:
-        """Serve the page on which a user marks object and hands, until every camera has masks."""
-        print("      Mark object and hands in the page that opens, carry them through the film, and press Save masks.", flush=True)
+        """Serve the annotation page until every camera has masks."""
+        print("      In the page, outline object and hands, press Carry this camera, and press Save masks.", flush=True)
         with subprocess.Popen(command) as page:
             try:
                 while page.poll() is None and not self._masked():
@@ -147,27 +147,27 @@ class TwinChain:
             finally:
                 if page.poll() is None:
                     page.send_signal(signal.SIGINT)
-        told = "" if self._masked() else "the page ended before masks were saved\n"
-        log.write_text(told, encoding="utf-8")
-        print(told, end="", file=sys.stderr)
-        return 2 if told else 0
+        failure = "" if self._masked() else "the annotation page ended before masks were saved\n"
+        log.write_text(failure, encoding="utf-8")
+        print(failure, end="", file=sys.stderr)
+        return 2 if failure else 0
 
     def _window(self) -> Path:
-        """The capture that the twin is learned from: all frames, or those of one grip."""
+        """Folder of the capture to learn from: all frames, or those of one grasp."""
         log = self._step("check", _neuspring("check-data", str(self.capture)))
         wish, before = self.wish, self.done.get("window", [""])[0]
-        found = PROPOSED.search(log.read_text(encoding="utf-8")) if log.is_file() else None
-        window = wish.window or before or (found[1] if found else "all")
-        if found and not (wish.window or before or wish.yes or wish.dry_run):
+        proposed = PROPOSED.search(log.read_text(encoding="utf-8")) if log.is_file() else None
+        window = wish.window or before or (proposed[1] if proposed else "all")
+        if proposed and not (wish.window or before or wish.yes or wish.dry_run):
             if sys.stdin.isatty():
-                window = input(f"      Hands change. Frames to learn from: {window} (a constant grip), all, or others? ") or window
+                window = input(f"      The grasp changes. Learn from {window} (one grasp), all, or other frames? ") or window
                 _require_window("answer", window)
-            print(f"      Frames {window} are learned from: --window all takes all.")
+            print(f"      The twin learns from frames {window}; --window all uses all frames.")
         cut = self.folder / "captures" / f"{self.capture.name}_{window}"
         if window != "all" and (cut / CAPTURE).is_file():
             masks = max((path.stat().st_mtime for path in (self.capture / "mask").glob("*")), default=0.0)
             if masks > (cut / CAPTURE).stat().st_mtime:
-                raise InputError(cut, f"must have the masks of {self.capture}", "older ones", "Delete this folder.")
+                raise InputError(cut, f"must have the present masks of {self.capture}", "older masks", "Delete this folder.")
         elif window != "all":
             cutting = _neuspring("cut-capture", str(self.capture), "--frames", window, "--output", str(cut))
             self._step("check", cutting)
@@ -175,7 +175,7 @@ class TwinChain:
         return self.capture if window == "all" else cut
 
     def _twin(self, capture: Path) -> None:
-        """Observe, search, fit and page: the workflow, in one run that tells a line per job."""
+        """Run the workflow: observe, search, fit, report."""
         chosen: dict[str, object] = {"scenarios": [capture.name], "methods": list(dict.fromkeys([BESIDE, self.method]))}
         chosen |= {
             "data_root": str(capture.parent),
@@ -187,14 +187,14 @@ class TwinChain:
         options = ["--directory", str(self.folder), "--config", *settings]
         self._step("twin", workflow_command("own", *options, cores=self.wish.cores))
 
-    # --- what all steps share
+    # --- shared by all steps
 
     def _step(self, name: str, command: list[str], made: bool = False, run: StepRun | None = None) -> Path:
         """Run a step unless it is `made`; returns its log. Raises StepFailed."""
         log = self.folder / "logs" / f"{TWIN_STEPS.index(name) + 1}_{name}.log"
         print(f"$ {shlex.join(command)}", flush=True)
         if made or self.wish.dry_run:
-            self._say(name, "done before" if made else "not run")
+            self._say(name, "already done" if made else "not run")
             return log
         log.parent.mkdir(parents=True, exist_ok=True)
         self._say(name, "...")
@@ -202,8 +202,8 @@ class TwinChain:
         status = (run or _run)(command, log)
         print(f"      {'failed' if status else duration(time.monotonic() - begun)}", flush=True)
         if status:
-            print(f"Step {name} failed, exit status {status}. Its output: {log}", file=sys.stderr)
-            print(f"By hand:\n  {shlex.join(command)}\nneuspring twin goes on from here.", file=sys.stderr)
+            print(f"Step {name} failed with exit status {status}. Output: {log}", file=sys.stderr)
+            print(f"Fix the cause, then rerun neuspring twin. To run this step alone:\n  {shlex.join(command)}", file=sys.stderr)
             raise StepFailed(status)
         self._keep(name, command)
         return log
@@ -219,18 +219,18 @@ class TwinChain:
             write_text(self.folder / STEPS_DONE, json.dumps(self.done, indent=1) + "\n")
 
     def _tell(self, scenario: Path) -> int:
-        """Size of the twin, errors beside the row that learns nothing, and what to open."""
+        """Print the size of the twin, its errors and those of the baseline, and the files to open."""
         print(_made_of(RunFolder.of(scenario / self.method / "0")), end="")
         print("Errors in mm, future frames (training frames):")
         for method in dict.fromkeys([BESIDE, self.method]):
             scores = RunFolder.of(scenario / method / "0").scores
             errors = 1000 * scores[scores["unit"] == "m"].pivot(index="metric", columns="task", values="value")
-            told = [f"{row.Index} {row.future:.1f} ({row.reconstruction:.1f})" for row in errors.dropna().itertuples()]
-            print(f"  {method:<16} {', '.join(told)}")
+            values = [f"{row.Index} {row.future:.1f} ({row.reconstruction:.1f})" for row in errors.dropna().itertuples()]
+            print(f"  {method:<16} {', '.join(values)}")
         run = scenario / self.method / "0"
-        places = {"page": self.folder / "results" / "tables" / "report.html", "film": run / "video.mp4"}
-        places |= {"masks, tracks, points": scenario / "perception", "logs": self.folder / "logs"}
-        print("".join(f"{name}: {path}\n" for name, path in places.items() if path.exists()), end="")
+        paths = {"report": self.folder / "results" / "tables" / "report.html", "video": run / "video.mp4"}
+        paths |= {"masks, tracks, points": scenario / "perception", "logs": self.folder / "logs"}
+        print("".join(f"{name}: {path}\n" for name, path in paths.items() if path.exists()), end="")
         command = _neuspring("play", str(run))
         print(f"play: {shlex.join(command)}", flush=True)
         if self.wish.play:
@@ -239,13 +239,13 @@ class TwinChain:
 
 
 def _made_of(run: RunFolder) -> str:
-    """Nodes, springs, and how much of the surface is invented, in a line; empty where the method has no springs."""
+    """Line with the numbers of nodes and springs and the invented fraction of the surface; empty without springs."""
     twin, facts = run.twin, {name: value for record in run.records.values() for name, value in record.facts.items()}
     if twin is None:
         return ""
     unseen = facts.get("unseen_surface")
     size = f"Twin: {len(twin.topology.nodes):,} nodes, {len(twin.topology.springs):,} springs"
-    return size + (f"; no camera saw {100 * unseen:.0f} % of its surface, which is invented\n" if unseen else "\n")
+    return size + (f"; {100 * unseen:.0f} % of its surface is invented, because no camera saw it\n" if unseen else "\n")
 
 
 def _neuspring(*words: str) -> list[str]:
@@ -253,8 +253,8 @@ def _neuspring(*words: str) -> list[str]:
 
 
 def _run(command: list[str], log: Path) -> int:
-    """Run a command whose output is shown and logged; returns its exit status. Ctrl-C reaches it too, and its end is waited for."""
-    # Without it Python keeps what it prints into a pipe until the end.
+    """Run a command with shown and logged output; returns its exit status. After Ctrl-C, waits for its end."""
+    # Otherwise Python buffers output to a pipe until the end.
     now = os.environ | {"PYTHONUNBUFFERED": "1"}
     with log.open("w", encoding="utf-8") as output, subprocess.Popen(command, env=now, **JOINED) as process:
 
@@ -278,18 +278,18 @@ def _option(name: str, value: Any) -> str:
 
 def _require_window(where: str, text: str) -> None:
     if not WINDOW.fullmatch(text):
-        raise InputError(where, "a first and a last frame are required, as in 12-97, or all", text)
+        raise InputError(where, "must be a first and a last frame, as in 12-97, or all", text)
 
 
 def _parts(film: Path) -> list[str]:
-    """The options of make-capture that name the parts of a film."""
+    """Options of make-capture that name the files of a video."""
     if film.is_file() and film.suffix.lower() in MOVIE_ENDINGS:
         return ["--color", str(film)]
     inside = sorted(film.iterdir()) if film.is_dir() else []
     options: list[str] = []
     for option, stems in {"color": ("color", "rgb"), "depth": ("depth",)}.items():
-        found = [path for path in inside if path.stem in stems and (path.is_file() or any(map(Path.is_file, path.iterdir())))]
-        options += [f"--{option}", str(found[0])] if found else []
+        paths = [path for path in inside if path.stem in stems and (path.is_file() or any(map(Path.is_file, path.iterdir())))]
+        options += [f"--{option}", str(paths[0])] if paths else []
     if "--color" not in options:
         return ["--recording", str(film)]
     files = [path for path in inside if path.name == "rig.json"]

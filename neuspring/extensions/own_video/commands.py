@@ -6,7 +6,7 @@ from neuspring.extensions.own_video.options import Wish
 
 
 def twin(wish: Wish) -> int:
-    """A film of your own -> its twin, errors, a page and films. The same command goes on where it was stopped."""
+    """Make a twin of your own video, with errors, a report and videos; rerun the same command to resume."""
     from neuspring.extensions.own_video.chain import TwinChain
 
     return TwinChain(wish).run()

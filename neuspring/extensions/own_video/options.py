@@ -1,4 +1,4 @@
-"""Options of `neuspring twin`; nothing heavy is imported, because every `--help` reads them."""
+"""Options of `neuspring twin`; imports nothing heavy, because every `--help` reads them."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from neuspring.config.effort import Effort
 
 @dataclass(frozen=True, kw_only=True)
 class Wish:
-    """The film, and what is wanted of it: the options of `neuspring twin`."""
+    """The options of `neuspring twin`."""
 
     film: Positional[Path]
-    """a folder with color/, depth/ and rig.json; a bag; a video; or a capture"""
+    """folder with color/, depth/ and rig.json, bag, video file, or capture"""
     output: Path | None = None
-    """folder for everything, whose name is the twin's; twins/<name of the film> by default"""
+    """folder for all results, which names the twin; twins/<name of the video> by default"""
     category: str = "object"
-    """kind of object: cloth, rope, package, or any other word"""
+    """kind of object: cloth, package, rope, or any other word"""
     mass: float | None = None
-    """mass of the object, kg, for exports"""
+    """mass of the object, kg; scales exports"""
     frames: str = ""
-    """frames of the film that are kept, like 250-335"""
+    """frames of the video to keep, such as 250-335"""
     intake: str = ""
-    """more options of make-capture, as one text: --intake="--pair order --shift 0.depth=1" """
+    """further options of make-capture in one string: --intake="--pair order --shift 0.depth=1" """
     masks: tuple[Path, ...] = ()
-    """per camera a folder of another tool's masks: 0 nothing, 1 object, 2 hands"""
+    """one folder of another tool's masks per camera: 0 nothing, 1 object, 2 hands"""
     hands: tuple[Path, ...] = ()
-    """per camera a folder of masks of the hands alone, beside --masks"""
+    """one folder of masks of the hands per camera, in addition to --masks"""
     marks: Path | None = None
-    """a marks.json, which is carried through the film; without masks and marks, annotate opens"""
+    """a marks.json to carry through the video; without --masks and --marks, the annotation page opens"""
     no_browser: bool = False
-    """annotate prints its address, and opens no browser"""
+    """print the address of the annotation page without opening a browser"""
     window: str = ""
-    """frames of the capture that the twin is learned from, like 12-97, or all; by default the longest constant grip"""
+    """frames of the capture to learn from, such as 12-97, or all; by default those of the longest constant grasp"""
     yes: bool = False
-    """ask nothing"""
+    """do not ask questions"""
     effort: Effort = "quick"
-    """sizes of search, fit and pictures"""
+    """sizes of search, fit and renders"""
     method: str | None = None
-    """row of config/methods.yaml; the last one of config/data/own.yaml by default"""
+    """a method of config/methods.yaml; by default the last one of config/data/own.yaml"""
     cores: int | None = None
-    """all by default"""
+    """number of CPU cores; all by default"""
     dry_run: bool = False
-    """print the commands, and run none"""
+    """print the commands without running them"""
     play: Annotated[bool, arg(help="open the twin in the browser at the end")] = False

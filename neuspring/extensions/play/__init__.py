@@ -1,1 +1,1 @@
-"""The playground: runs of a results folder in the browser, in space and time, and twins that can be pulled."""
+"""The playground: runs of a results folder in the browser, and twins to pull with the mouse."""

@@ -13,14 +13,14 @@ from neuspring.core.errors import InputError
 def play(
     results: Annotated[
         Positional[tuple[Path, ...]],
-        arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario; the sample twin by default"),
+        arg(help="results/<scenario>, or runs <scenario>/<method>/<seed> of one scenario; by default the sample twin"),
     ] = (),
-    host: Annotated[str, arg(help="address to listen at; the default is for this machine alone")] = "127.0.0.1",
-    port: Annotated[int, arg(help="0: any that is free")] = 8080,
-    frame: Annotated[int, arg(help="frame to begin with")] = 0,
-    no_open: Annotated[bool, arg(help="print the address, and open no browser")] = False,
+    host: Annotated[str, arg(help="address to listen at; by default only this machine can connect")] = "127.0.0.1",
+    port: Annotated[int, arg(help="port to listen at; 0: any free port")] = 8080,
+    frame: Annotated[int, arg(help="first frame to show")] = 0,
+    no_open: Annotated[bool, arg(help="print the address without opening a browser")] = False,
 ) -> None:
-    """Runs of a results folder in the browser, until Ctrl-C; twins that can be pulled by hand."""
+    """Show runs of a results folder in the browser, and pull their twins with the mouse; stop with Ctrl-C."""
     from neuspring.core.web import is_loopback, open_page
     from neuspring.data.sample import sample_twin
     from neuspring.extensions.play.page import Page
@@ -30,7 +30,7 @@ def play(
     found = find(results or (sample_twin(),))
     frames = found.observations.scenario.frame_count
     if not 0 <= frame < frames:
-        raise InputError("--frame", f"{found.folder.name} has the frames 0 to {frames - 1}", frame)
+        raise InputError("--frame", f"must be 0 to {frames - 1} for {found.folder.name}", frame)
     pages: list[Page] = []
 
     def go_to(chosen: int) -> None:
@@ -42,9 +42,9 @@ def play(
     page.show(frame)
     pages.append(page)
     print(f"Play {found.folder.name} at {address(server)} (stop with Ctrl-C)", flush=True)
-    print("To pull the twin there: Live, Start, then take it with the mouse.", flush=True)
+    print("To pull the twin, press Start under Live, then pull it with the mouse.", flush=True)
     if not is_loopback(host):
-        print("Everybody who can reach this address sees and moves the scene; an SSH tunnel to 127.0.0.1 is safer.", flush=True)
+        print("Everyone who can reach this address can see and move the scene. An SSH tunnel to 127.0.0.1 is safer.", flush=True)
     if not no_open:
         open_page(address(server))
     try:

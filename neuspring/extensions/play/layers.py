@@ -1,4 +1,4 @@
-"""Layers of the scene: a run's nodes, springs and hands, and its splats."""
+"""Layers of the scene: nodes, springs, controllers and splats of a run."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from trimesh.visual.material import PBRMaterial
 from neuspring.core.artifacts import SplatCenters, Twin
 from neuspring.draw.sheet import sample
 from neuspring.extensions.play.colors import Scale, linear
+from neuspring.extensions.play.simulator import hands_of
 from neuspring.splats.model import Splats
 from neuspring.splats.skinning import Skin
 from neuspring.splats.view import C0
@@ -24,24 +25,23 @@ if TYPE_CHECKING:
 
 NODE_COLOR, HAND_COLOR, GRABBED_COLOR, NOT_SEEN_COLOR = (70, 90, 120), (214, 39, 40), (255, 200, 0), (150, 150, 150)
 UNSEEN_REACH = 3.5
-"""Distance from all points that were seen, in median distances between them, from which nobody saw a part of the body. Of points
-that are spread at random over a surface, one in a thousand places is farther from its nearest point."""
+"""Distance from all observed points, in median distances between them, beyond which a part of the object counts as unseen. With
+random points on a surface, one location in a thousand is farther from its nearest point."""
 SPLAT_UNIT = 1e-3
-"""m. The browser has covariances in 16-bit floats, which are too coarse for squares of meters."""
+"""Unit of splats, m: the browser uses 16-bit floats for covariances, which are too coarse for square meters."""
 WIDEST_SPLAT = 200.0
-"""Largest standard deviation of a splat, mm: the largest whose square 16 bits hold, less a margin."""
+"""Largest standard deviation of a splat, mm; its square must fit into 16 bits."""
 MOST_DRAWN_SPLATS = 60_000
-"""Splats that are drawn: 32 bytes each go to the browser in each frame."""
+"""Largest number of drawn splats; each sends 32 bytes per frame to the browser."""
 
 
 class BodyLayer:
-    """The nodes, springs and hands of a run, and its splats where it has any."""
+    """Nodes, springs and controllers of a run, with a label per hand, and its splats if it has any."""
 
     def __init__(self, scene: viser.SceneApi, name: str, twin: Twin | None, nodes: np.ndarray, hands: np.ndarray) -> None:
-        self.name, self._scene, self._count = name, scene, len(nodes)
+        self.name, self._scene = name, scene
         self.lines = lines_of(twin) if twin else None
-        chosen = sample(len(self.lines.pairs)) if self.lines else None
-        self._chosen = slice(None) if chosen is None else chosen
+        self._chosen = sample(len(self.lines.pairs)) if self.lines else slice(None)
         self.root = scene.add_frame(f"/{name}", show_axes=False)
         size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
         radius = max(0.3 * spacing(nodes), 0.004 * size)
@@ -50,6 +50,8 @@ class BodyLayer:
         self._handles: Any = None
         self.nodes = _balls(scene, f"/{name}/nodes", nodes, radius, np.tile(NODE_COLOR, (len(nodes), 1)))
         self.hands = _balls(scene, f"/{name}/hands", hands, 1.3 * radius, HAND_COLOR)
+        _, first = np.unique(hands_of(hands, hands[:0]), return_index=True)
+        self._hand_labels = {index: scene.add_label(f"/{name}/hands/{index}", "hand") for index in first}
         self.springs: Any = None
         if self.lines is not None and len(self.lines.pairs):
             ends = self._ends(nodes, hands)
@@ -64,7 +66,7 @@ class BodyLayer:
         return np.zeros(0) if self.lines is None else self.lines.stiffness[self._chosen]
 
     def show(self, springs: bool, splats: bool) -> None:
-        """Show nodes, springs and hands, or splats; the former also in place of splats that the run does not have."""
+        """Show or hide springs (with nodes and controllers) and splats. A run without splats always shows its springs."""
         bare = springs or self.splats is None
         self.nodes.visible = self.hands.visible = bare
         if self.springs is not None:
@@ -73,14 +75,16 @@ class BodyLayer:
             self.splats.handle.visible = splats
 
     def paint(self, scale: Scale) -> None:
-        """Color the springs."""
+        """Color the springs by stiffness."""
         if self.springs is not None:
             self.springs.colors = np.repeat(linear(scale.paint(self.stiffness))[:, None], 2, axis=1)
 
     def move(self, nodes: np.ndarray, hands: np.ndarray) -> None:
-        """Draw nodes [N, 3] and hands [C, 3], m."""
+        """Draw nodes [N, 3] and controllers [C, 3], m."""
         self.nodes.batched_positions = np.asarray(nodes, np.float32)
         self.hands.batched_positions = np.asarray(hands, np.float32)
+        for index, label in self._hand_labels.items():
+            label.position = hands[index]
         if self._handles is not None:
             self._handles.batched_positions = np.asarray(nodes, np.float32)
         self.label.position = (*nodes.mean(axis=0)[:2], float(nodes[:, 2].max()) + 0.02)
@@ -88,28 +92,28 @@ class BodyLayer:
             self.springs.points = self._ends(nodes, hands)
 
     def mark(self, node: int) -> None:
-        """Show a grabbed node in yellow; -1: none."""
-        colors = np.tile(np.array(NODE_COLOR, np.uint8), (self._count, 1))
+        """Color a grabbed node yellow; -1: none."""
+        colors = np.tile(np.array(NODE_COLOR, np.uint8), (len(self.nodes.batched_positions), 1))
         if node >= 0:
             colors[node] = GRABBED_COLOR
         self.nodes.batched_colors = linear(colors)
 
     def handles(self) -> Any:
-        """Unseen balls about the nodes, large enough to be hit with a mouse.
+        """Add invisible balls around the nodes, large enough to hit with the mouse.
 
-        All their pixels are cut out (alpha mask): what is merely transparent would hide the splats behind it.
+        An alpha mask removes their pixels, because transparent balls would hide the splats behind them.
         """
-        places = self.nodes.batched_positions
+        positions = self.nodes.batched_positions
         ball = trimesh.creation.icosphere(subdivisions=1, radius=self._reach)
         clear = PBRMaterial(baseColorFactor=(0, 0, 0, 0), alphaMode="MASK", alphaCutoff=0.5)
         ball.visual = trimesh.visual.TextureVisuals(material=clear)
         look: dict[str, Any] = {"lod": "off", "cast_shadow": False, "receive_shadow": False}
         content = ball.export(file_type="glb")
-        self._handles = self._scene.add_batched_glb(f"/{self.name}/handles", content, _still(len(places)), places, **look)
+        self._handles = self._scene.add_batched_glb(f"/{self.name}/handles", content, _still(len(positions)), positions, **look)
         return self._handles
 
     def remove(self) -> None:
-        """Take it out of the scene."""
+        """Remove the run from the scene."""
         self.root.remove()
 
     def _ends(self, nodes: np.ndarray, hands: np.ndarray) -> np.ndarray:
@@ -119,14 +123,14 @@ class BodyLayer:
 
 
 def unseen(points: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-    """True for points [n, 3] far from all that were seen in the same frame [m, 3], m; none is where that is not known."""
+    """True for points [n, 3] far from all observed points of the same frame [m, 3], m; False for all if `seen` is None."""
     if seen is None:
         return np.zeros(len(points), bool)
     return np.asarray(cKDTree(seen).query(points)[0] > UNSEEN_REACH * spacing(seen))
 
 
 def spacing(nodes: np.ndarray) -> float:
-    """Median distance of a node to its nearest neighbor, m; 0.01 for one node."""
+    """Median distance of a node from its nearest neighbor, m; 0.01 for a single node."""
     if len(nodes) < 2:
         return 0.01
     return max(float(np.median(cKDTree(nodes).query(nodes, k=2)[0][:, 1])), 1e-4)
@@ -138,17 +142,17 @@ def _still(count: int) -> np.ndarray:
 
 def _balls(scene: viser.SceneApi, name: str, centers: np.ndarray, radius: float, colors: Any) -> Any:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=radius)
-    places, look = np.asarray(centers, np.float32), linear(np.asarray(colors, np.uint8))
+    positions, look = np.asarray(centers, np.float32), linear(np.asarray(colors, np.uint8))
     options: dict[str, Any] = {"batched_colors": look, "lod": "off", "cast_shadow": False, "receive_shadow": False}
-    return scene.add_batched_meshes_simple(name, ball.vertices, ball.faces, _still(len(places)), places, **options)
+    return scene.add_batched_meshes_simple(name, ball.vertices, ball.faces, _still(len(positions)), positions, **options)
 
 
 class SplatLayer:
-    """The splats of one run, made in the frame in which the nodes are at `nodes` [N, 3], m.
+    """Splats of one run, defined in the frame with nodes at `nodes` [N, 3], m.
 
-    The nodes of the shown frame carry them from that frame in one step, instead of from frame to frame as for images
-    (splats/skinning.py), so that any frame can be shown after any other. Of the color only the part is shown that does not depend
-    on the direction. Those farther than UNSEEN_REACH from all points `seen` [m, 3] in that frame are gray.
+    Skinning moves them from that frame to the shown frame in one step, so that frames can be shown in any order; for renders it
+    proceeds from frame to frame (splats/skinning.py). View-dependent colors are omitted. Splats farther than UNSEEN_REACH from
+    all points `seen` [m, 3] of that frame are gray.
     """
 
     def __init__(
@@ -166,7 +170,7 @@ class SplatLayer:
         scales = np.exp(splats.log_scales[chosen].astype(float)) / SPLAT_UNIT
         self._scales = np.minimum(np.broadcast_to(scales, (len(chosen), 3)), WIDEST_SPLAT).astype(np.float32)
         colors = np.clip(0.5 + C0 * splats.harmonics[chosen, 0], 0, 1)
-        # Half their own light: a plain gray would show no shape.
+        # Keeps half of their brightness, because a constant gray would hide the shape.
         hidden = unseen(splats.means[chosen], seen)
         colors[hidden] = 0.5 * (np.array(NOT_SEEN_COLOR) / 255 + colors[hidden].mean(axis=1, keepdims=True))
         opacities = 1 / (1 + np.exp(-splats.opacity_logits[chosen, None]))
@@ -182,7 +186,7 @@ class SplatLayer:
         )
 
     def carried(self, nodes: np.ndarray, frame: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Centers [G, 3], m, and quaternions [G, 4] with the nodes at [N, 3], m; a model's own centers in its frames."""
+        """Centers [G, 3], m, and quaternions [G, 4] for nodes [N, 3], m; with `frame`, the model's own centers if it has any."""
         if self._centers is not None and frame is not None:
             means = self._centers.positions[min(frame, len(self._centers.positions) - 1)][self._chosen]
             return np.asarray(means), np.asarray(self._turns.numpy())
@@ -190,7 +194,7 @@ class SplatLayer:
         return means.numpy(), turns.numpy()
 
     def move(self, nodes: np.ndarray, frame: int | None = None) -> None:
-        """Draw them with the nodes at [N, 3], m, if they are seen."""
+        """Draw the splats for nodes [N, 3], m, if they are visible."""
         if self.handle.visible:
             means, turns = self.carried(nodes, frame)
             old = self.handle
@@ -198,6 +202,6 @@ class SplatLayer:
 
 
 def covariances(quaternions: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """R diag(s^2) R^T [G, 3, 3] of quaternions [G, 4], w first, of any length but zero, and standard deviations [G, 3]."""
+    """Covariances R diag(s^2) R^T [G, 3, 3] from nonzero quaternions [G, 4], w first, and standard deviations s [G, 3]."""
     half = Rotation.from_quat(quaternions, scalar_first=True).as_matrix() * scales[:, None]
     return np.asarray(half @ half.transpose(0, 2, 1), np.float32)

@@ -1,4 +1,4 @@
-"""A twin in your hands: it is simulated in real time while its nodes and hands are grabbed and pulled with the mouse."""
+"""Live mode: a twin is simulated in real time while the user pulls its nodes and hands with the mouse."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     import viser
 
 FASTEST_GRAB = 3.0
-"""m/s: a grab follows a faster mouse at this speed, as a jump would tear the twin."""
+"""Largest speed of a grab, m/s, because a jump of the mouse would tear the twin."""
 
 
 class Live:
-    """One twin, simulated in a thread of its own, one frame of the twin after another. It stands still while nobody watches."""
+    """One twin, simulated frame by frame in its own thread. It pauses while no browser has the page open."""
 
     def __init__(self, server: viser.ViserServer, player: Player, run: Run) -> None:
         twin = run.twin
         if twin is None:
-            raise InputError(run.folder, "a run with a twin is required", "none", "Choose a method that makes a twin.")
+            raise InputError(run.folder, "the run must have a twin", "none", "Choose a method that makes a twin.")
         self.run, self._server, self._player = run, server, player
         self.simulator = Simulator(twin)
         hands = self.simulator.hands
@@ -46,29 +46,26 @@ class Live:
         self._thread.start()
 
     def close(self) -> None:
-        """End the simulation, and take the twin out of the scene."""
+        """Stop the simulation, and remove the twin from the scene."""
         self._stop.set()
         self._thread.join(10)
         self.body.remove()
 
     def reset(self) -> None:
-        """Back to the start before the next step."""
+        """Return to frame 0 before the next step."""
         self._again.set()
 
     def status(self) -> str:
-        """Frame rate and what is held, as HTML."""
-        simulator, node = self.simulator, self.simulator.grabbed
+        """Frame rate, time, held node, message and legend, as HTML."""
+        simulator = self.simulator
         wanted = 1 / simulator.twin.simulation.frame_time
-        held = f"node {node} is held, k = {simulator.grab_stiffness(node)[0]:.3g} N/m" if node >= 0 else "nothing is held"
-        lines = [
-            f"<b>{self.rate:.1f} frames/s</b> of {wanted:.0f}",
-            f"{simulator.frame / wanted:.1f} s; {held}",
-            escape(self.message),
-        ]
-        return f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{'<br>'.join(filter(None, lines))}</div>"
+        held = f"node {simulator.grabbed} is held (yellow)" if simulator.grabbed >= 0 else "no node is held"
+        text = f"<b>{self.rate:.1f}</b> of {wanted:.0f} fps<br>{simulator.frame / wanted:.1f} s; {held}<br>{escape(self.message)}"
+        scale = self._player.scale
+        return f"<div style='margin:0 .8em;font-size:.8em;overflow-wrap:anywhere'>{text}</div>{scale.legend() if scale else ''}"
 
     def _listen(self) -> None:
-        """Take drags. Asynchronous functions keep the order of a drag's events."""
+        """Register the drag listeners. Asynchronous functions keep the order of a drag's events."""
 
         def listener(kind: str) -> Any:
             async def dragged(event: Any) -> None:
@@ -86,7 +83,7 @@ class Live:
         self.body.hands.on_drag("left")(listener("hand"))
 
     def _take(self, event: Any, kind: str) -> None:
-        """Grab a hand, or the node nearest to where the mouse points."""
+        """Grab a hand, or the node nearest to the mouse pointer."""
         index, x = event.instance_index, self.simulator.positions
         if kind == "node":
             index = nearest_to_ray(x, event.client.camera.position, event.start_position)
@@ -104,14 +101,14 @@ class Live:
             try:
                 self._step(frame_time)
             except Diverged as end:
-                self._restart(f"{end}; it began again")
+                self._restart(f"{end}; the simulation restarted")
             except Exception as error:
-                self.message = f"stopped: {error}"
+                self.message = f"The simulation stopped: {error}"
                 return
             ends.append(time.monotonic())
             if len(ends) > 1:
                 self.rate = (len(ends) - 1) / max(ends[-1] - ends[0], 1e-9)
-            # A slow machine falls behind, and does not hurry later.
+            # A slow machine falls behind, and does not catch up later.
             due = max(due + frame_time, time.monotonic())
             self._stop.wait(max(due - time.monotonic(), 0.001))
 
@@ -122,7 +119,7 @@ class Live:
         self.message = message
 
     def _step(self, frame_time: float) -> None:
-        """A frame: controls, simulation, drawing."""
+        """Advance by one frame: controls, simulation, drawing."""
         simulator, node = self.simulator, self.grab.node
         before = simulator.grabbed
         at = simulator.target if node == before else simulator.positions[max(node, 0)]
@@ -134,7 +131,7 @@ class Live:
                 self.body.mark(simulator.grabbed)
 
     def _draw_splats(self, x: np.ndarray, frame_time: float) -> None:
-        """Move the splats, in as many frames as 0.4 of the time allows."""
+        """Move the splats, in as many frames as fit into 40 % of the time."""
         splats, every = self.body.splats, max(1, math.ceil(self._splat_seconds / (0.4 * frame_time)))
         if splats is not None and splats.handle.visible and self.simulator.frame % every == 0:
             start = time.monotonic()
@@ -143,9 +140,9 @@ class Live:
 
 
 class Grab:
-    """Grab of a twin with `nodes` nodes: its holder, the node or hand, and the wanted hands [C, 3], m. Safe for threads.
+    """Grab of a node or a hand by one browser at a time; thread-safe. It checks all values that browsers send.
 
-    One grab at a time, of a node or a hand, by one browser. What browsers send is checked here.
+    `nodes`: number of nodes; `hands` [C, 3], m: controllers; `groups` [C]: their hand indices.
     """
 
     def __init__(self, nodes: int, hands: np.ndarray, groups: np.ndarray) -> None:
@@ -153,16 +150,16 @@ class Grab:
         self.reset(hands)
 
     def reset(self, hands: np.ndarray) -> None:
-        """Let go; hands are at [C, 3], m."""
+        """Release the grab; controllers are at [C, 3], m."""
         with self._lock:
             self.owner: int | None = None
             self.node, self._target, self._shift = -1, np.zeros(3, np.float32), np.zeros(3, np.float32)
             self._hand, self._from = -1, np.zeros(3)
             self.wanted = self._base = hands.copy()
 
-    def take(self, client: int, kind: str, index: Any, place: Any, at: Any = None) -> bool:
-        """A browser grabs a node, which is at `at` [3], m, or a hand, with the mouse at `place` [3], m; returns whether it may."""
-        point = _point(place)
+    def take(self, client: int, kind: str, index: Any, position: Any, at: Any = None) -> bool:
+        """Grab a node at `at` [3], m, or a hand, with the mouse at `position` [3], m. Returns False if it is not allowed."""
+        point = _point(position)
         with self._lock:
             most = self._nodes if kind == "node" else len(self._groups)
             if self.owner is not None or point is None or not isinstance(index, int) or not 0 <= index < most:
@@ -175,9 +172,9 @@ class Grab:
                 self._hand, self._from, self._base = int(self._groups[index]), point, self.wanted.copy()
             return True
 
-    def pull(self, client: int, place: Any) -> None:
-        """Its mouse is at `place` [3], m."""
-        point = _point(place)
+    def pull(self, client: int, position: Any) -> None:
+        """Move the grab of a browser to the mouse position `position` [3], m."""
+        point = _point(position)
         with self._lock:
             if self.owner != client or point is None:
                 return
@@ -187,13 +184,13 @@ class Grab:
                 self.wanted[self._groups == self._hand] += point - self._from
 
     def release(self, client: int) -> None:
-        """It lets go, or its page is closed. A hand stays where it is."""
+        """Release the grab of a browser, also when its page is closed. A hand keeps its position."""
         with self._lock:
             if self.owner == client:
                 self.owner, self.node, self._hand = None, -1, -1
 
     def next(self, seconds: float, hands: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-        """Hands [C, 3], node and target [3] at the end of a frame, from hands and target (`at`) at its begin."""
+        """Controllers [C, 3], node and target [3] at the end of a frame, from controllers and target (`at`) at its start."""
         with self._lock:
             wanted, node, target = self.wanted, self.node, self._target
         reach = FASTEST_GRAB * seconds
@@ -201,7 +198,7 @@ class Grab:
 
 
 def nearest_to_ray(points: np.ndarray, eye: Any, through: Any) -> int:
-    """The point [N, 3] nearest to the line from the eye [3] through a place [3], m."""
+    """Index of the point [N, 3] nearest to the line from the eye [3] through a position [3], m."""
     eye, way = np.asarray(eye, float), np.asarray(through, float) - np.asarray(eye, float)
     way /= max(float(np.linalg.norm(way)), 1e-12)
     offset = points - eye
@@ -209,15 +206,15 @@ def nearest_to_ray(points: np.ndarray, eye: Any, through: Any) -> int:
 
 
 def _limited(moves: np.ndarray, reach: float) -> np.ndarray:
-    """Moves [..., 3], m, none longer than `reach`."""
+    """Moves [..., 3], m, shortened to at most `reach`."""
     length = np.linalg.norm(moves, axis=-1, keepdims=True)
     return np.asarray(moves * np.minimum(1.0, reach / np.maximum(length, 1e-12)), np.float32)
 
 
-def _point(place: Any) -> np.ndarray | None:
-    """A place that a browser sent, if it is one in the scene."""
+def _point(position: Any) -> np.ndarray | None:
+    """Position sent by a browser, or None if it is invalid or outside the scene."""
     try:
-        point = np.asarray(place, np.float32)
+        point = np.asarray(position, np.float32)
     except (TypeError, ValueError):
         return None
     return point if point.shape == (3,) and np.isfinite(point).all() and np.abs(point).max() < 100 else None

@@ -1,4 +1,4 @@
-"""The page beside the scene: time, runs, what is shown, the legend, and a twin in your hands."""
+"""The control panel: live twin, time, runs, switches and legend."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     import viser
 
 VIEW_ANGLE = math.radians(45)
-"""Vertical angle of view."""
+"""Vertical angle of view, radians."""
 PHONE, PANEL_SHARE = 576, 0.45
-"""A window narrower than this, CSS pixels, has its panel below, over this part of it."""
+"""In windows narrower than this, CSS pixels, the panel covers this fraction at the bottom."""
 FIT = (
     f"<style>@media (max-width: {PHONE}px) {{ [style*='max-height: 60%'] {{ width: 100% !important; "
     f"max-height: {PANEL_SHARE:.0%} !important }} [style*='width: 20em'] {{ width: 100% !important }} }}</style>"
 )
-"""viser's panel on a phone is as wide as the window."""
+"""Style that widens viser's panel to the window on a phone."""
 SWITCHES = {"splats": "Splats", "springs": "Springs, nodes, hands (red)", "points": "Observed points (green)"}
 
 
 class Page:
-    """The controls, shared by all browsers that have the page open."""
+    """The controls, shared by all browsers with the page open."""
 
     def __init__(self, server: viser.ViserServer, found: Found) -> None:
         self.server, self.found, self.player = server, found, Player(server.scene, found)
@@ -37,7 +37,7 @@ class Page:
         self._stop, self._moved, self._lock = threading.Event(), False, threading.RLock()
         scenario, gui = found.observations.scenario, server.gui
         server.scene.set_up_direction(scenario.up)
-        # Beside the scene, not over it.
+        # Next to the scene instead of over it.
         gui.main_panel.dock_right()
         camera = server.initial_camera
         camera.fov = VIEW_ANGLE
@@ -45,18 +45,14 @@ class Page:
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._left)
         gui.add_html(FIT)
-        gui.add_markdown(
-            f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames at {scenario.frame_rate:g} per second. "
-            "Forces are shown as if each node, or each meter of a cable, weighed 1 kg; `neuspring export --mass` scales them."
-        )
+        gui.add_markdown(f"**{scenario.name}** ({scenario.category}): {scenario.frame_count} frames, {scenario.frame_rate:g} fps")
         with gui.add_folder("Live"):
             self._add_live()
         with gui.add_folder("Recording"):
             self._add_time()
         with gui.add_folder("Show"):
-            without = not any("splats" in run.paths for run in found.runs)
             self.parts: dict[str, Any] = {
-                name: gui.add_checkbox(title, getattr(self.player, name), disabled=without and name == "splats")
+                name: gui.add_checkbox(title, getattr(self.player, name), disabled=name == "splats" and not self.player.splats)
                 for name, title in SWITCHES.items()
             }
             self.legend = gui.add_html("")
@@ -72,7 +68,7 @@ class Page:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the clock."""
+        """Stop the clock and a live twin."""
         self._stop.set()
         self._thread.join(5)
         self.end()
@@ -84,21 +80,20 @@ class Page:
         marks = ((0, "0"), (min(clock.border, last), "future"), (last, str(last)))
         self.slider: Any = gui.add_slider("Frame", 0, last, 1, 0, marks=marks)
         self.play = gui.add_button("Play")
-        # Only what a person does: the clock moves the slider too.
+        # Reacts only to users, because the clock moves the slider too.
         self.slider.on_update(lambda event: self.show(int(self.slider.value)) if event.client_id is not None else None)
         self.play.on_click(lambda _: self.toggle())
-        keys = {"space": self.toggle}
-        keys |= {"arrowright": lambda: self.show(clock.frame + 1), "arrowleft": lambda: self.show(clock.frame - 1)}
-        for key, action in keys.items():
+        steps = {"arrowright": lambda: self.show(clock.frame + 1), "arrowleft": lambda: self.show(clock.frame - 1)}
+        for key, action in {"space": self.toggle, **steps}.items():
             gui.add_command(f"Time: {key}", hotkey=key).on_trigger(lambda _, action=action: action())  # type: ignore[misc,arg-type]
 
     def _add_live(self) -> None:
         gui, names = self.server.gui, [run.name for run in self.found.runs if "twin" in run.paths]
         self.text = gui.add_html("")
         if not names:
-            gui.add_markdown("No run here has a twin, so there is nothing to pull.")
+            gui.add_markdown("No run has a twin to pull.")
             return
-        gui.add_markdown("Start, then drag a node or a hand with the left button. Drag beside them to turn the view.")
+        gui.add_markdown("Press Start, then drag a node or a hand (red) with the left button. Drag elsewhere to rotate the view.")
         self.twin = gui.add_dropdown("Twin", tuple(names))
         self.switch, self.again = gui.add_button("Start"), gui.add_button("Reset", disabled=True)
         self.switch.on_click(lambda _: self.end() if self.live else self.begin(self.twin.value))
@@ -106,7 +101,7 @@ class Page:
         self.twin.on_update(lambda _: self.begin(self.twin.value) if self.live else None)
 
     def begin(self, name: str) -> None:
-        """Simulate a run's twin in place of the recording, with its springs."""
+        """Simulate a run's twin in place of the recording, and show its springs."""
         with self._lock:
             self.end()
             try:
@@ -120,7 +115,7 @@ class Page:
             self._frame_all()
 
     def end(self) -> None:
-        """Back to the recording."""
+        """End a live twin, and return to the recording."""
         with self._lock:
             if self.live is not None:
                 self.live.close()
@@ -130,21 +125,21 @@ class Page:
                 self._frame_all()
 
     def toggle(self) -> None:
-        """Play, or pause; a live twin ends."""
+        """Play or pause the recording; ends a live twin."""
         self.end()
         with self.player.lock:
             self.player.clock.playing = not self.player.clock.playing
         self.play.label = "Pause" if self.player.clock.playing else "Play"
 
     def show(self, frame: int) -> None:
-        """Go to a frame, and stay there; a live twin ends."""
+        """Show a frame and pause; ends a live twin."""
         self.end()
         with self.player.lock:
             self.player.clock.playing, self._moved = False, True
             self.player.clock.show(frame)
 
     def _changed(self) -> None:
-        """Take over what was switched."""
+        """Apply the switches."""
         player = self.player
         with player.lock:
             for name, box in self.parts.items():
@@ -153,10 +148,10 @@ class Page:
             player.apply()
             if self.live is not None:
                 player.dress(self.live.body, self.live.run, springs=True)
-            self.legend.content = player.scale.legend() if player.scale else ""
+            self.legend.content = player.scale.legend() if player.scale and player.springs else ""
             notes = [f"{name}: {note}" for name, note in player.notes.items() if note and name in player.runs]
             if len(player.runs) > MOST_RUNS_SHOWN:
-                notes.append(f"{MOST_RUNS_SHOWN} runs are shown at once; take some away to see others")
+                notes.append(f"At most {MOST_RUNS_SHOWN} runs are shown; deselect some to see others")
             rows = "<br>".join(escape(note[:400]) for note in [*self.found.notes, *notes])
             self.notes.content = f"<div style='margin:0 .8em;font-size:.8em'>{rows}</div>"
 
@@ -164,13 +159,13 @@ class Page:
         self.player.watched.set()
         self._frame(client)
         wide, end = client.camera.image_width, time.monotonic() + 5
-        # The panel takes its place a moment later.
+        # The panel changes the width of the scene a moment later.
         while client.camera.image_width == wide and time.monotonic() < end and not self._stop.wait(0.1):
             pass
         self._frame(client)
 
     def _left(self, client: viser.ClientHandle) -> None:
-        """A closed page lets go; time stands still while nobody has the page open."""
+        """Release the grab of a closed page; pause while no browser has the page open."""
         if self.live is not None:
             self.live.grab.release(client.client_id)
         if not self.server.get_clients():
@@ -181,16 +176,16 @@ class Page:
             self._frame(client)
 
     def _frame(self, client: viser.ClientHandle) -> None:
-        """Let a browser see all that is shown, whatever the shape of its window."""
+        """Fit all shown runs into the window of a browser."""
         camera = client.camera
         wide, high = max(camera.image_width, 1), max(camera.image_height, 1)
         covered, count = (PANEL_SHARE if wide < PHONE else 0.0), (1 if self.live else MOST_RUNS_SHOWN)
-        # A new place moves what is looked at, so that this comes last.
+        # Setting the position changes look_at, so look_at comes last.
         _, look_at, camera.position = self.player.view(camera.fov, wide / high, covered, count)
         camera.look_at = look_at
 
     def _tick(self) -> None:
-        """Let time pass, and draw what has changed, at most 30 times per second."""
+        """Advance time and draw changes, at most 30 times per second."""
         last = told = time.monotonic()
         while not self._stop.wait(1 / 30):
             now, player = time.monotonic(), self.player

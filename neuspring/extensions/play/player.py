@@ -1,4 +1,4 @@
-"""The recording in the scene: runs side by side, at a frame of a clock that runs, is scrubbed, and starts again at the end."""
+"""The recording: runs side by side, at the frame of a clock that plays in a loop or is set by the user."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ if TYPE_CHECKING:
     import viser
 
 LEAST_LEVEL = 0.02
-"""Least level part of the first view's direction, of its vertical part."""
+"""Smallest horizontal component of the first view's direction, as a fraction of the vertical one."""
 MOST_RUNS_SHOWN = 8
-"""Runs that are shown at once."""
+"""Largest number of runs shown at once."""
 
 
 @dataclass
 class Clock:
-    """Time of a recording of `count` frames at `rate` frames/s, whose frames from `border` on are future frames."""
+    """Time of a recording of `count` frames at `rate` frames/s; future frames begin at `border`."""
 
     count: int
     rate: float
     border: int
     time: float = 0.0
-    """Frames since frame 0, with fractions."""
+    """Time since frame 0, in frames, with fractions."""
     playing: bool = False
 
     @property
     def frame(self) -> int:
-        """The frame that is shown."""
+        """The shown frame."""
         return min(int(self.time), self.count - 1)
 
     def advance(self, seconds: float) -> bool:
-        """Let time pass, from the last frame on to the first; returns whether the frame has changed."""
+        """Advance time, from the last frame to the first; returns True if the frame changed."""
         before = self.frame
         if self.playing:
             self.time = (self.time + max(seconds, 0.0) * self.rate) % self.count
         return self.frame != before
 
     def show(self, frame: int) -> None:
-        """Go to a frame; outside ones are the first or the last."""
+        """Go to a frame, clipped to the recording."""
         self.time = float(min(max(frame, 0), self.count - 1))
 
     def bar(self) -> str:
-        """The timeline as HTML: training and future frames, the border between them, and the shown frame."""
+        """Timeline as HTML: training and future frames, their border, and the shown frame."""
         border, here = (100 * value / max(self.count - 1, 1) for value in (self.border - 0.5, self.frame))
         border = min(max(border, 0.0), 100.0)
         part, color = ("training", "#2171b5") if self.frame < self.border else ("future", "#d94801")
@@ -68,7 +68,7 @@ class Clock:
 
 
 class Player:
-    """Draws the shown runs at the clock's frame. All methods may be called from any thread."""
+    """Draws the shown runs at the clock's frame; thread-safe."""
 
     def __init__(self, scene: viser.SceneApi, found: Found) -> None:
         seen, scenario = found.observations, found.observations.scenario
@@ -79,14 +79,14 @@ class Player:
         """Names of the shown runs."""
         self.splats = any("splats" in run.paths for run in found.runs)
         self.springs, self.points = not self.splats, False
-        """Switches: splats; nodes, springs and hands; observed points."""
+        """Switches: splats; springs with nodes and controllers; observed points."""
         self.notes: dict[str, str] = {}
-        """Run -> why it is not shown, or what to know about it."""
+        """Run -> remarks, for example why it is not shown."""
         self.scale: Scale | None = None
         self._scene, self._bodies, self._hidden = scene, dict[str, BodyLayer](), False
         cameras = list(found.capture.cameras.values()) if found.capture else []
         self.seen = seen.object_points[0] if cameras else None
-        """Points that cameras saw in frame 0 [m, 3], m; None: there are no images."""
+        """Observed points in frame 0 [m, 3], m; None without images."""
         self._eye = cameras[0].camera_to_world[:3, 3] if len(cameras) == 1 else None
         all_hands, holds = seen.controller_points, seen.controller_valid
         hands = all_hands[holds] if holds.size else all_hands.reshape(-1, 3)
@@ -107,7 +107,7 @@ class Player:
         return next(run for run in self.found.runs if run.name == name)
 
     def apply(self) -> None:
-        """Make the scene agree with the switches."""
+        """Update the scene from the switches."""
         with self.lock:
             wanted = self.runs[:MOST_RUNS_SHOWN]
             for name in [name for name in self._bodies if name not in wanted]:
@@ -118,14 +118,14 @@ class Player:
             stiffness = [body.stiffness for body in self._bodies.values() if len(body.stiffness)]
             self.scale = Scale.of(stiffness) if stiffness else None
             for index, name in enumerate(name for name in wanted if name in self._bodies):
-                self.dress(self._bodies[name], self.run(name))
-                self._bodies[name].root.position = self.offset(index)
-                self._bodies[name].root.visible = not self._hidden
+                body = self._bodies[name]
+                self.dress(body, self.run(name))
+                body.root.position, body.root.visible = self.offset(index), not self._hidden
             self._points.visible = self.points and not self._hidden
             self.draw()
 
     def dress(self, body: BodyLayer, run: Run, *, springs: bool = False) -> None:
-        """Show the switched parts of a body, the run's splats among them when they are first wanted; `springs`: in any case."""
+        """Show the selected parts of a run, and load its splats on first use; `springs`: always show them."""
         if self.splats and body.splats is None and "splats" in run.paths:
             try:
                 if run.splats is not None and run.trajectory is not None:
@@ -138,13 +138,13 @@ class Player:
             body.paint(self.scale or Scale.of([body.stiffness]))
 
     def hide(self, hidden: bool) -> None:
-        """Take the recording out of sight, for a live twin; time stands still meanwhile."""
+        """Hide or show the recording; hidden, it pauses for a live twin."""
         with self.lock:
             self._hidden, self.clock.playing = hidden, False
             self.apply()
 
     def offset(self, index: int) -> tuple[float, float, float]:
-        """Shift of a run, m: side by side, across the view, along x or y; the first one where it was observed."""
+        """Shift of a run, m: side by side across the view, along x or y; 0 for the first run."""
         right = np.cross((0.0, 0.0, self.found.observations.scenario.up_sign), self._way())
         axis = int(np.abs(right[1]) >= np.abs(right[0]))
         wide = max(float(self.high[axis] - self.low[axis]), 0.5 * self.size)
@@ -152,11 +152,11 @@ class Player:
         return (0.0, shift, 0.0) if axis else (shift, 0.0, 0.0)
 
     def _way(self) -> np.ndarray:
-        """Unit direction [3] from the body to the first view: to the only camera, which did not see the back; else from above."""
+        """Unit direction [3] from the object to the initial view: to a single camera, to show the seen side; else oblique."""
         way = np.array([1.0, -0.35, 0.45 * self.found.observations.scenario.up_sign])
         if self._eye is not None:
             way = self._eye - 0.5 * (self.low + self.high)
-        # Straight from above nothing says which side is up.
+        # A view from straight above would have no up direction.
         if np.linalg.norm(way[:2]) < LEAST_LEVEL * abs(way[2]):
             way[0] += LEAST_LEVEL * abs(way[2])
         return np.asarray(way / np.linalg.norm(way))
@@ -164,9 +164,9 @@ class Player:
     def view(
         self, opening: float, aspect: float = 1.6, covered: float = 0.0, count: int = MOST_RUNS_SHOWN
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Up, the point that is looked at, and the eye [3], m, of a view that contains the first `count` shown runs.
+        """Up, look-at point and eye [3], m, of a view that contains the first `count` shown runs.
 
-        `opening`: vertical angle, radians; `aspect`: width over height; the lower part `covered` of the window is not free.
+        `opening`: vertical angle, radians; `aspect`: width over height; `covered`: fraction of the window covered at the bottom.
         """
         sign = float(self.found.observations.scenario.up_sign)
         shifts = np.array([self.offset(index) for index in range(max(min(len(self.runs), count), 1))])
@@ -182,7 +182,7 @@ class Player:
         return up, look_at, look_at + distance * way
 
     def draw(self) -> None:
-        """Show the clock's frame."""
+        """Draw the clock's frame."""
         with self.lock:
             frame, seen = self.clock.frame, self.found.observations
             for name, body in self._bodies.items():
@@ -196,7 +196,7 @@ class Player:
                 self._points.points = seen.object_points[frame][seen.object_visibility[frame]]
 
     def _add(self, run: Run) -> None:
-        """Put a run into the scene; what is missing becomes a note."""
+        """Add a run to the scene; missing parts become notes."""
         notes, hands = list(run.notes), self.found.observations.controller_points[0]
         try:
             if run.trajectory is None or not len(run.trajectory.positions):
@@ -204,13 +204,13 @@ class Player:
                 return
             nodes = run.trajectory.positions[0]
             if run.trajectory.diverged_frame is not None:
-                notes.append(f"left the scene in frame {run.trajectory.diverged_frame}; it stays where it was before")
+                notes.append(f"diverged in frame {run.trajectory.diverged_frame}; later frames show its last position")
             twin = None
             try:
                 twin = run.twin
                 if twin and (len(twin.topology.nodes), len(twin.topology.controllers)) != (len(nodes), len(hands)):
                     notes.append(
-                        f"no springs: its twin has other nodes or hands than its prediction, {len(nodes)} and {len(hands)}"
+                        f"no springs: twin and prediction must have the same {len(nodes)} nodes and {len(hands)} controllers"
                     )
                     twin = None
             except InputError as error:

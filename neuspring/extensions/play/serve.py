@@ -1,4 +1,4 @@
-"""A viser server that listens where it is told, at the port it is told, and answers this machine's own pages alone."""
+"""A viser server that listens exactly at the given host and port, and answers only its own pages."""
 
 from __future__ import annotations
 
@@ -19,65 +19,65 @@ if TYPE_CHECKING:
 
 SERVER_LABEL = "NeuSpring"
 VISIT = re.compile(r"/(?:\?frame=([0-9]{1,9})(?:&scenario=([A-Za-z0-9_.-]{1,200}))?)?")
-"""The page, and a frame of it, perhaps of a scenario that must be the one that is shown."""
+"""Address of the page, optionally with a frame, and with a scenario that must be the shown one."""
 FILE_HEADERS = {"X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer"}
-"""Headers of every file of the page."""
+"""Headers of all files of the page."""
 PAGE_HEADERS = {"Cache-Control": "no-store"}
-"""Headers of the page itself: a browser that kept it for its button "back" would keep its connection, and with it what is held."""
+"""Headers of the page itself. A browser that caches it for its back button keeps the connection, and with it a grabbed node."""
 
 
 def start(
     host: str, port: int, asked: Callable[[int], object] = lambda frame: None, scenario: str | None = None
 ) -> viser.ViserServer:
-    """A running server at host and port (0: any that is free); `asked` gets the frame of an address that ends in /?frame=<number>.
+    """Start a server at host and port (0: any free port); `asked` receives the frame of addresses /?frame=<number>.
 
-    `scenario` is the one that is shown: an address that ends in &scenario=<name> of another one is refused. None: all are answered.
-    Raises InputError where it cannot listen there, or without viser.
+    Addresses with &scenario=<name> are refused if the name is not `scenario`, the shown one; None accepts all names. Raises
+    InputError if it cannot listen there, or without viser.
     """
     needed("viser")
     import viser
 
     _require_free(host, port)
-    # viser takes another port from this variable, whatever it is told.
+    # This variable would override the port.
     os.environ.pop("_VISER_PORT_OVERRIDE", None)
     with _guarded(host, asked, scenario) as used, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=SERVER_LABEL, verbose=False)
     if not used:
         server.stop()
-        raise InputError("viser", "this version cannot be told whom to answer", viser.__version__, "Install viser >=1.1,<2.")
+        raise InputError("viser", "must be a version whose requests can be checked", viser.__version__, "Install viser >=1.1,<2.")
     if port and server.get_port() != port:
         server.stop()
-        raise _taken(host, port, "another program has just taken it")
-    # A page could ask viser to publish this server through a tunnel.
+        raise _taken(host, port, "another program uses it now")
+    # Otherwise a page could request viser to publish this server through a tunnel.
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     return server
 
 
 def address(server: viser.ViserServer) -> str:
-    """Address to open in a browser."""
+    """Address to open in the browser."""
     host = server.get_host()
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
 
 
 def asked_frame(path: str, scenario: str | None) -> int | None:
-    """The frame that an address asks for, if it asks for a frame and for nothing more than its scenario.
+    """Frame of an address /?frame=<number>, optionally with &scenario=<name>; None for other addresses.
 
-    Raises Refused where that is not `scenario`, the one that is shown.
+    Raises Refused if the name is not `scenario`, the shown one.
     """
-    found = VISIT.fullmatch(path)
-    if found is None or not found[1]:
+    visit = VISIT.fullmatch(path)
+    if visit is None or not visit[1]:
         return None
-    if found[2] and scenario and found[2] != scenario:
-        text = f"This player shows {scenario}. Run `neuspring play` on the folder of {found[2]}, then follow the link again."
+    if visit[2] and scenario and visit[2] != scenario:
+        text = f"This player shows {scenario}. Run `neuspring play` on the folder of {visit[2]}, then follow the link again."
         raise Refused(404, text)
-    return int(found[1])
+    return int(visit[1])
 
 
 def _is_visit(request: Any) -> bool:
-    """True where a person follows a link to the page, from a report for instance: a window of its own, no frame of another site.
+    """True if a user follows a link to the page, for example from a report, in a window that no other site embeds.
 
-    Other parameters are refused: viser's page takes from them where it connects to, and shows what it gets from there.
+    Other parameters are refused, because they can connect viser's page to another server and show its content.
     """
     headers = request.headers
     navigates = (headers.get("Sec-Fetch-Mode"), headers.get("Sec-Fetch-Dest")) == ("navigate", "document")
@@ -85,34 +85,34 @@ def _is_visit(request: Any) -> bool:
 
 
 def _require_free(host: str, port: int) -> None:
-    """Raise InputError where nobody could listen: viser would take the next port, or wait forever."""
+    """Raise InputError if the port is not free: viser would use the next port, or wait forever."""
     if not 0 <= port < 65536:
-        raise InputError("--port", "must lie between 0 and 65535", port)
+        raise InputError("--port", "must be 0 to 65535", port)
     try:
-        family, kind, proto, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        family, kind, proto, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except (OSError, UnicodeError) as error:
-        rule, told = "must be an address of this machine", f"{host}: {error}"
-        raise InputError("--host", rule, told, "Leave it out for 127.0.0.1.") from error
+        rule, received = "must be an address of this machine", f"{host}: {error}"
+        raise InputError("--host", rule, received, "Omit it to use 127.0.0.1.") from error
     with socket.socket(family, kind, proto) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(place)
+            probe.bind(target)
             probe.listen()
         except OSError as error:
             raise _taken(host, port, error.strerror) from error
 
 
 def _taken(host: str, port: int, reason: object) -> InputError:
-    remedy = "Stop the other program, or choose another: --port 0 takes any that is free."
-    return InputError(f"--port {port}", f"it must be possible to listen at {host}:{port}", reason, remedy)
+    remedy = "Stop the other program, or choose another port; --port 0 selects a free one."
+    return InputError(f"--port {port}", f"{host}:{port} must be free", reason, remedy)
 
 
 @contextlib.contextmanager
 def _guarded(host: str, asked: Callable[[int], object], scenario: str | None) -> Iterator[list[bool]]:
-    """Servers that are started inside check each request's Host and Origin; the list is empty if none was started.
+    """Servers started inside check Host and Origin of each request; the yielded list stays empty if none was started.
 
-    viser has no place for such a check. Without it any page of the web that this browser shows could reach the server, by its
-    address or by a name of its own that points here (DNS rebinding).
+    viser has no hook for this check. Without it, any web page in the user's browser could reach the server, by its address or by
+    DNS rebinding.
     """
     from websockets.asyncio import server as module
 

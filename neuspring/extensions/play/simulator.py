@@ -1,13 +1,17 @@
-"""A twin that is pulled: one frame of simulation after another, under hands and a grab that are given as it goes.
+"""Interactive simulation of a twin, frame by frame, with controllers and a grabbed node that move while it runs.
 
-A grabbed node follows its target by a spring without rest length, beside the twin's own springs: F = k (target - x) - c v_along,
-with k the sum of the stiffnesses Y / l0 of the node's own springs, at most what the stability bound leaves at the twin's substep,
-and c critical for the node's mass, bounded in the same way. The target is a controller more, which moves straight within a frame.
+A spring of rest length 0 pulls a grabbed node to its target:
+
+    F = k (target - x) - c v_along
+
+k is the sum of Y / l0 over the node's own springs, and c is critical for the node's mass. Both are limited by the stability bound
+at the twin's substep. The target is an additional controller, which moves linearly within a frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,13 +25,13 @@ from neuspring.twin.body import body_of
 from neuspring.twin.rollout import FAR_AWAY, Diverged
 
 GRAB_REST_LENGTH = 1e-6
-"""Rest length of the spring of a grab, m: the solver has none of length 0."""
+"""Rest length of the grab's spring, m, because the solver requires a positive length."""
 MOST_SOLVERS = 8
-"""Solvers of grabbed nodes that are kept."""
+"""Number of cached solvers of grabbed nodes."""
 
 
 class Simulator:
-    """A twin's state, frame by frame, from frame 0 at rest. Equal controls give equal states, bit for bit: it runs on the CPU."""
+    """State of a twin, from rest in frame 0. It runs on the CPU, so that equal controls give bitwise equal states."""
 
     def __init__(self, twin: Twin) -> None:
         body = self._body = body_of(twin)
@@ -35,11 +39,11 @@ class Simulator:
         self.twin = twin = body.for_prediction(twin)
         self._load = body.load(twin)
         self._free = body.solver(twin)
-        self._held: dict[int, Any] = {}
+        self._held = lru_cache(MOST_SOLVERS)(lambda node: body.solver(self._with_grab(node)))
         self.reset()
 
     def reset(self) -> None:
-        """Back to the start."""
+        """Return to frame 0."""
         self.frame, self.grabbed = 0, -1
         self._last: Any = None
         self._x = torch.tensor(self.twin.topology.nodes)
@@ -53,9 +57,9 @@ class Simulator:
         return self._x.numpy()
 
     def step(self, hands: np.ndarray, grabbed: int = -1, target: np.ndarray | None = None) -> np.ndarray:
-        """Nodes [N, 3], m, a frame later: hands move to [C, 3], m, and a grabbed node is pulled to `target` [3], m.
+        """Advance by one frame: controllers move to `hands` [C, 3], m, and a grabbed node is pulled to `target` [3], m.
 
-        A grab begins where the node is. Raises Diverged, and stays as it was before.
+        Returns the nodes [N, 3], m. A grab begins at the node's position. Raises Diverged, and then keeps the previous state.
         """
         hands = np.asarray(hands, np.float32)
         begin, end, solver, aim = self.hands, hands, self._free, self.target
@@ -63,15 +67,11 @@ class Simulator:
             aim = np.asarray(target, np.float32)
             start = self.target if grabbed == self.grabbed else self.positions[grabbed]
             begin, end = np.concatenate([begin, start[None]]), np.concatenate([end, aim[None]])
-            if grabbed not in self._held:
-                if len(self._held) >= MOST_SOLVERS:
-                    self._held.pop(next(iter(self._held)))
-                self._held[grabbed] = self._body.solver(self._with_grab(grabbed))
-            solver = self._held[grabbed]
+            solver = self._held(grabbed)
         if self._last not in (None, solver):
             solver.follow(self._last)
         x, v = solver.forward(self._x, self._v, torch.tensor(begin), torch.tensor(end))
-        # NaN compares false.
+        # NaN also counts as diverged.
         if not bool((x.abs() < FAR_AWAY).all()):
             raise Diverged(self.frame + 1, f"a node left the scene in frame {self.frame + 1}")
         self._last = solver
@@ -80,29 +80,29 @@ class Simulator:
         return self.positions
 
     def grab_stiffness(self, node: int) -> tuple[float, float]:
-        """k [N/m] and c [N s/m] of the spring that pulls a node."""
+        """k, N/m, and c, N s/m, of the spring that pulls a node."""
         topology, material, dt = self.twin.topology, self.twin.material, self.twin.simulation.substep
         own = (topology.springs == node).any(axis=1)
         mass = self._body.mass_at(self.twin, node)
         wanted = float((material.stiffness[own] / topology.rest_lengths[own]).sum())
-        # Half of what is left is for k, half for c: dt^2 k / m + 2 dt c / m < 0.9 STABILITY_LIMIT - load.
-        room = max(0.9 * stability.STABILITY_LIMIT - self._load, 0.05) / 2
-        k = min(wanted or room * mass / dt**2, room * mass / dt**2)
-        return k, min(2 * np.sqrt(k * mass), room * mass / (2 * dt))
+        # k and c each get half of the remaining bound: dt^2 k / m + 2 dt c / m < 0.9 STABILITY_LIMIT - load.
+        margin = max(0.9 * stability.STABILITY_LIMIT - self._load, 0.05) / 2
+        k = min(wanted or margin * mass / dt**2, margin * mass / dt**2)
+        return k, min(2 * np.sqrt(k * mass), margin * mass / (2 * dt))
 
     def _with_grab(self, node: int) -> Twin:
-        """The twin with one controller and one spring more."""
+        """The twin with an additional controller and spring for the grab."""
         topology, material = self.twin.topology, self.twin.material
         k, c = self.grab_stiffness(node)
-        own = len(topology.nodes) + len(topology.controllers)
-        place = topology.nodes[node][None]
+        target = len(topology.nodes) + len(topology.controllers)
+        position = topology.nodes[node][None]
         rest = topology.rest_shape
         more = replace(
             topology,
-            controllers=np.concatenate([topology.controllers, place]),
-            springs=np.concatenate([topology.springs, np.array([[own, node]], np.int32)]),
+            controllers=np.concatenate([topology.controllers, position]),
+            springs=np.concatenate([topology.springs, np.array([[target, node]], np.int32)]),
             rest_lengths=np.append(topology.rest_lengths, np.float32(GRAB_REST_LENGTH)),
-            rest_shape=np.concatenate([rest, place]) if len(rest) else rest,
+            rest_shape=np.concatenate([rest, position]) if len(rest) else rest,
             pushes=np.append(topology.pushes, False) if topology.pushes.size else topology.pushes,
         )
         stiffness = np.append(material.stiffness, np.float32(k * GRAB_REST_LENGTH))
@@ -111,9 +111,9 @@ class Simulator:
 
 
 def hands_of(controllers: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """The hand [C] of each controller [C, 3], m: those that move together, as observations know it (`given`).
+    """Hand index [C] of each controller [C, 3], m, from observations (`given`).
 
-    Where they do not, controllers nearer than 0.15 m to each other, directly or through others, are one hand.
+    If `given` is empty, controllers within 0.15 m of each other, directly or through others, form one hand.
     """
     if len(given) == len(controllers):
         return np.unique(given, return_inverse=True)[1]

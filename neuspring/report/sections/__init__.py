@@ -1,1 +1,1 @@
-"""Sections of the report page, one module each; a `SECTION` says what makes it and where it stands."""
+"""Sections of the report page, one module each. `section` in a module declares the title, the position and the function."""

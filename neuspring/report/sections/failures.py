@@ -1,4 +1,4 @@
-"""Failures: failed jobs, damaged files, runs that do not count, notes."""
+"""Failures: failed jobs, damaged files, runs outside the averages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from neuspring.report.tables import failure_blocks
 
 
 def failures(material: ReportData) -> list[Block]:
-    """Everything that keeps runs out of the tables."""
+    """Failed jobs, damaged files and runs outside the averages, with their reasons."""
     blocks: list[Block] = []
     if failed := [job for job in material.jobs if job.failed]:
         folder = material.output.resolve().parent
@@ -18,17 +18,19 @@ def failures(material: ReportData) -> list[Block]:
         for job in failed[:MOST_ROWS]:
             log = material.results / job.log
             target = link(log, folder) if log.is_file() else ""
-            texts = [
-                Cell(text=job.name),
-                Cell(text=job.message, wrap=True),
-                Cell(text=duration(job.seconds), value=job.seconds),
-            ]
-            rows.append([*texts, Cell(text="log" if target else job.log, link=target)])
+            rows.append(
+                [
+                    Cell(text=job.name),
+                    Cell(text=job.message, wrap=True),
+                    Cell(text=duration(job.seconds), value=job.seconds),
+                    Cell(text="log" if target else job.log, link=target),
+                ]
+            )
         blocks.append(Table(caption="Failed jobs", header=["Job", "Message", "Time", "Log"], rows=rows))
     if material.damaged:
-        damaged = [[Cell(text=path), Cell(text=why, wrap=True)] for path, why in list(material.damaged.items())[:MOST_ROWS]]
-        note = "Delete a damaged file and run the same command again."
-        blocks.append(Table(caption="Damaged files", header=["File", "Why"], rows=damaged, note=note))
+        damaged = [[Cell(text=path), Cell(text=reason, wrap=True)] for path, reason in list(material.damaged.items())[:MOST_ROWS]]
+        note = "Delete the damaged files, then rerun the same command."
+        blocks.append(Table(caption="Damaged files", header=["File", "Reason"], rows=damaged, note=note))
     blocks += failure_blocks(material.numbers)
     return blocks or [Text(text="Nothing has failed.", tone="good")]
 

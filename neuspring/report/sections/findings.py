@@ -1,4 +1,4 @@
-"""Findings of perception, searches and fits on their own results."""
+"""Findings: what perception, searches and fits report about their own results."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ LEVEL_TONES: dict[str, Tone] = {"error": "bad", "warning": "warn", "note": "mute
 
 
 def findings(material: ReportData) -> list[Block]:
-    """A table of warnings, and a folded one of notes; none where nothing was found."""
-    found = [(name, one) for name in material.choice.scenarios for one in findings_of(material.results, name)]
-    found += of_runs(material.runs)
+    """A table of warnings and a folded table of notes; empty without findings."""
+    pairs = [(name, finding) for name in material.choice.scenarios for finding in findings_of(material.results, name)]
+    pairs += of_runs(material.runs)
     blocks: list[Block] = []
-    for caption, noted in (("Warnings", False), ("Notes", True)):
-        part = [pair for pair in found if (pair[1].level == "note") == noted]
+    for caption, are_notes in (("Warnings", False), ("Notes", True)):
+        part = [pair for pair in pairs if (pair[1].level == "note") == are_notes]
         rows = []
-        for name, one in part[:MOST_ROWS]:
-            texts = [Cell(text=text) for text in (name, one.where, one.name)]
-            rows.append([*texts, Cell(text=one.text, wrap=True), Cell(text=one.level, tone=LEVEL_TONES[one.level])])
-        table = Table(caption=caption, header=["Scenario", "Where", "What", "Finding", "Level"], rows=rows)
-        blocks += [Fold(summary=several(len(part), "note"), blocks=[table]) if noted else table] if part else []
+        for name, finding in part[:MOST_ROWS]:
+            texts = [Cell(text=text) for text in (name, finding.where, finding.name)]
+            rows.append([*texts, Cell(text=finding.text, wrap=True), Cell(text=finding.level, tone=LEVEL_TONES[finding.level])])
+        table = Table(caption=caption, header=["Scenario", "Subject", "Check", "Finding", "Level"], rows=rows)
+        blocks += [Fold(summary=several(len(part), "note"), blocks=[table]) if are_notes else table] if part else []
     return blocks
 
 
-section = ReportSection(order=60, title="Findings of perception and fits", make=findings)
+section = ReportSection(order=60, title="Warnings and notes", make=findings)

@@ -1,4 +1,4 @@
-"""The benchmark's tables, as `neuspring tables` writes them, with the figure of ratios."""
+"""The tables that `neuspring tables` writes, and the figure of the ratios."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The studies, as `neuspring study` writes them."""
+"""The tables that `neuspring study` writes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from neuspring.report.study import blocks_of
 
 
 def studies(material: ReportData) -> list[Block]:
-    """A fold per study that was asked for, or of which several methods ran on the paper's data; none without any."""
+    """One fold per requested study, and per study of which at least two methods ran on the paper's data."""
     choice, runs = material.choice, material.table.runs
     of_paper = set(runs.loc[(runs["status"] == "ok") & (runs["source"] == "phystwin"), "method"])
     asked = choice.settings.studies if choice.settings else ()
@@ -19,4 +19,4 @@ def studies(material: ReportData) -> list[Block]:
     ]
 
 
-section = ReportSection(order=45, title="The paper's tables", make=studies)
+section = ReportSection(order=45, title="The paper's tables", make=studies, about="Scores explains the columns.")

@@ -1,4 +1,4 @@
-"""The verdict: who is ahead, by how much, whether it is resolved, the next command."""
+"""The verdict: which method is ahead, by how much, and the next command."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from neuspring.report.tables import several
 
 
 def verdict(material: ReportData) -> list[Block]:
-    """The verdict, and how many jobs failed and files cannot be read."""
-    text = f"Nothing to report yet: {material.results.resolve().name} holds no run, and none was asked for."
+    """The verdict, the command that completes the runs, and the numbers of failed jobs and unreadable files."""
+    text = f"Nothing to report yet: the folder {material.results.resolve().name} contains no runs."
     blocks: list[Block] = tables.verdict(material.numbers) if len(material.table.runs) else [Text(text=text, tone="warn")]
     command = asked(material.results).get("command")
     if command and (material.table.runs["status"] != "ok").any():
-        blocks += [Text(text="Finish what is missing; finished runs are kept:"), Code(text=shlex.join(command))]
+        blocks += [Text(text="This command makes the missing runs and keeps the finished ones:"), Code(text=shlex.join(command))]
     failed = sum(job.failed for job in material.jobs)
     for count, noun, what in ((failed, "job", "failed"), (len(material.damaged), "file", "cannot be read")):
         if count:
-            blocks.append(Text(text=f"{several(count, noun)} {what}: see Failures.", tone="warn"))
+            blocks.append(Text(text=f"{several(count, noun)} {what}; see Failures.", tone="warn"))
     return blocks
 
 

@@ -1,4 +1,4 @@
-"""Hours and memory of jobs, by rule."""
+"""Time and memory of jobs per rule, and of stages per method."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neuspring.report.tables import cost_table
 
 
 def work(material: ReportData) -> list[Block]:
-    """Jobs by rule, stages by method; none where neither is recorded."""
+    """Table of jobs per rule and table of stages per method; empty if neither was recorded."""
     by_rule: dict[str, list[JobRecord]] = {}
     for job in material.jobs:
         by_rule.setdefault(job.rule, []).append(job)
@@ -28,4 +28,4 @@ def work(material: ReportData) -> list[Block]:
     return [*jobs_table, *([cost_table(material.numbers)] if len(material.table.task("time")) else [])]
 
 
-section = ReportSection(order=80, title="Time and hardware", make=work)
+section = ReportSection(order=80, title="Time and memory", make=work)

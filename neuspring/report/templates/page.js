@@ -1,4 +1,4 @@
-// Sorting and filtering, and films in step; everything can be read without.
+// Sorts and filters tables and plays videos in step. The page is readable without this script.
 for (const table of document.querySelectorAll("table.sortable")) {
   const body = table.tBodies[0];
   if (body.rows.length < 3) continue;
@@ -20,7 +20,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
       head.setAttribute("aria-sort", down ? "descending" : "ascending");
       const rows = [...body.rows].sort((a, b) => {
         const [x, y] = [key(a, column), key(b, column)];
-        // What has no number comes last, either way.
+        // Texts come last in both directions.
         if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;
         const order = typeof x === "number" ? x - y : x.localeCompare(y);
         return down ? -order : order;
@@ -38,7 +38,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
     table.parentElement.before(search);
   }
 }
-// The films of a group have one control, and play while they can be seen.
+// The videos of a group share one control and play while they are visible.
 const make = (kind, facts, ...inside) => {
   const made = Object.assign(document.createElement(kind), facts);
   made.append(...inside);
@@ -55,8 +55,8 @@ for (const group of document.querySelectorAll(".films")) {
   const button = make("button", { type: "button" });
   const slider = make("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0 });
   const speed = make("select", {}, ...[1, 0.5, 0.25].map((rate) => make("option", { value: rate }, `${rate} ×`)));
-  slider.setAttribute("aria-label", "Time of all films");
-  speed.setAttribute("aria-label", "Speed");
+  slider.setAttribute("aria-label", "Time of all videos");
+  speed.setAttribute("aria-label", "Playback speed");
   for (const film of films) Object.assign(film, { controls: false, loop: false });
   const label = () => (button.textContent = first.paused ? "▶ Play" : "❚❚ Pause");
   const seek = (time) => films.forEach((film) => (film.currentTime = Math.min(time, film.duration || time)));
@@ -76,11 +76,11 @@ for (const group of document.querySelectorAll(".films")) {
   const control = make("div", { className: "control", style: group.style.cssText }, button, slider, speed);
   group.before(control);
 }
-// A link to what is folded unfolds it.
+// A link into a folded section unfolds the section.
 const reveal = () => {
-  let one = location.hash && document.getElementById(location.hash.slice(1));
-  if (one) one.querySelector(":scope > details.part")?.setAttribute("open", "");
-  for (; one; one = one.parentElement) if (one.tagName === "DETAILS") one.open = true;
+  let element = location.hash && document.getElementById(location.hash.slice(1));
+  if (element) element.querySelector(":scope > details.part")?.setAttribute("open", "");
+  for (; element; element = element.parentElement) if (element.tagName === "DETAILS") element.open = true;
 };
 addEventListener("hashchange", reveal);
 reveal();

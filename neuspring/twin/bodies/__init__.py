@@ -1,1 +1,1 @@
-"""Bodies, one file each: `body` of a module here, or of an installed package, answers what `neuspring.twin.body` asks."""
+"""Bodies, one per file: the attribute `body` of a module here, or of an installed package, is a `neuspring.twin.body.Body`."""

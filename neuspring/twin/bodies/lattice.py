@@ -1,4 +1,4 @@
-"""The lattice: nodes that are joined by springs with dashpots, as in PhysTwin and the paper."""
+"""The lattice: nodes joined by springs with dashpots, as in PhysTwin and the paper."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ if TYPE_CHECKING:
 
 
 class Lattice(Body):
-    """Springs between nodes, in the topology and the material of a twin."""
+    """A spring-mass model, stored in the topology and the material of a twin."""
 
     name = "lattice"
     fits = ("springs", "field")
     by_gradients = True
     format = "neuspring-plain"
-    about = "A spring-mass twin: nodes that are joined by springs with dashpots"
+    about = "A spring-mass twin: nodes joined by springs with dashpots"
     equations = """
-Per frame there are `substeps` steps of dt = frame_time / substeps. Step k = 0, 1, ... of a frame does, in this order:
+A frame has `substeps` steps of dt = frame_time / substeps. Step k = 0, 1, ... of a frame computes, in this order:
 
 1. Controllers are at begin + (end - begin) u, u = (k + 1) / substeps, with begin and end the rows of `hands` of this frame and of
-the next. Nodes are where the step before left them.
+the next. Nodes are at the end of the previous step.
 
 2. Spring (i, j): d = (x_j - x_i) / l, l = |x_j - x_i|; force on i: (stiffness (l / rest_length - 1) + dashpot (v_j - v_i) . d) d,
-its negative on j. An index of N or more is controller index - N. Its velocity is 0; if controller_velocity is true, that of its
-path. A spring with `pushes` has no force while l > rest_length.
+its negative on j. An index of N or more is controller index - N. The velocity of a controller is 0 or, if controller_velocity is
+true, that of its path. A spring with `pushes` has no force while l > rest_length.
 
-3. A controller whose `holds` is false in this frame or in the next has springs without force in it.
+3. Springs of a controller have no force in this frame if its `holds` is false in this frame or in the next.
 
 4. w = v + dt (force / mass + (0, 0, -gravity up_sign)).
 
 5. Drag: v' = w exp(-dt drag).
 
-6. If self_collision: pairs of nodes that were closer than contact_distance at the begin of the frame, are so now, and approach
-(dx . dv < 0) change their velocity. With n = dx / |dx|, u = v_j - v_i = u_n + u_t, u_n along n, a = max(0, 1 - contact_friction
-(1 + contact_elasticity) |u_n| / |u_t|), node i loses the mean over its partners of mass_j / (mass_i + mass_j) (-(1 +
-contact_elasticity) u_n + (a - 1) u_t).
+6. If self_collision: pairs of nodes change their velocity if they were closer than contact_distance at the begin of the frame,
+are closer now, and approach (dx . dv < 0). With n = dx / |dx|, u = v_j - v_i = u_n + u_t, u_n along n, a = max(0, 1 -
+contact_friction (1 + contact_elasticity) |u_n| / |u_t|), node i loses the mean over its partners of mass_j / (mass_i + mass_j)
+(-(1 + contact_elasticity) u_n + (a - 1) u_t).
 
-7. x' = x + dt v'. If ground, and the step would take a node that moves down below z = 0 (z up_sign < 0): it moves to z = 0, its
-velocity becomes (a v_x, a v_y, -ground_elasticity v_z), a = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|),
-and it goes on for the rest of dt.
+7. x' = x + dt v'. If ground, a node that moves down and would be below z = 0 (z up_sign < 0) moves to z = 0. Its velocity becomes
+(a v_x, a v_y, -ground_elasticity v_z), a = max(0, 1 - ground_friction (1 + ground_elasticity) |v_z| / |v_xy|), and it moves on
+for the rest of dt.
 """
 
     def describes(self, twin: Twin) -> bool:
@@ -61,7 +61,7 @@ and it goes on for the rest of dt.
     def search(
         self, observations: Observations, pool: Sequence[Observations], settings: Config, options: SearchOptions
     ) -> SearchResult:
-        """CMA-ES over topology and a homogeneous material; see `search.search`."""
+        """Run CMA-ES over topology and a homogeneous material; see `search.search`."""
         from neuspring.twin.search import search
 
         return search(_problem(observations, pool, settings, options), options.seed, record=options.record, key=options.key)
@@ -69,12 +69,15 @@ and it goes on for the rest of dt.
     def search_many(self, tasks: Sequence[SearchTask]) -> Sequence[Learned | Exception]:
         from neuspring.twin.search import SearchRun, search_many
 
-        made = [_problem(one.observations, one.pool, one.settings, one.options) for one in tasks]
-        runs = [SearchRun(own, one.options.seed, one.options.record, one.options.key) for own, one in zip(made, tasks, strict=True)]
+        problems = [_problem(task.observations, task.pool, task.settings, task.options) for task in tasks]
+        runs = [
+            SearchRun(problem, task.options.seed, task.options.record, task.options.key)
+            for problem, task in zip(problems, tasks, strict=True)
+        ]
         return [*search_many(runs)]
 
     def fit(self, problem: FitProblem, *, partial: Path | None = None, key: str = "", threads: int = 1) -> FitResult:
-        """Adam, with gradients through the simulation; see `fit.fit`. It has one thread."""
+        """Run Adam with gradients through the simulation, on one thread; see `fit.fit`."""
         from neuspring.twin.fit import fit
 
         return fit(problem, partial=partial, key=key)
@@ -85,13 +88,13 @@ and it goes on for the rest of dt.
         return [*fit_many(tasks, most)]
 
     def require_pool(self, here: Observations, pool: Sequence[Observations]) -> None:
-        """Other recordings with as many nodes and hands, node i on node i; see `transfer.require_pool`."""
+        """Require as many nodes and controllers in all recordings, in the same order; see `transfer.require_pool`."""
         from neuspring.twin.transfer import require_pool
 
         require_pool(here, pool)
 
     def on_recording(self, twin: Twin, observations: Observations, rest_lengths: RestLengths) -> Twin:
-        """Springs with their ends on the same nodes; see `transfer.on_nodes`."""
+        """Keep the springs on the same nodes; see `transfer.on_nodes`."""
         from neuspring.twin.transfer import on_nodes
 
         return on_nodes(twin, observations, rest_lengths)
@@ -109,10 +112,10 @@ and it goes on for the rest of dt.
         return stability.twin_spectrum(twin).load(twin.simulation.substep)
 
     def lines(self, twin: Twin) -> Lines:
-        """All springs, those between nodes first."""
+        """Return all springs, object springs first."""
         topology, mass = twin.topology, twin.material.mass
         nodes, hands = len(topology.nodes), len(topology.controllers)
-        own = mass if len(mass) else np.ones(nodes, np.float32)
+        masses = mass if len(mass) else np.ones(nodes, np.float32)
         return Lines(
             pairs=topology.springs,
             rest_lengths=topology.rest_lengths,
@@ -121,12 +124,12 @@ and it goes on for the rest of dt.
             kind="springs",
             about="object springs",
             labels=np.pad(topology.labels, (0, hands), constant_values=topology.labels.min()),
-            masses=np.concatenate([own, np.zeros(hands, np.float32)]),
+            masses=np.concatenate([masses, np.zeros(hands, np.float32)]),
             points=lambda x, held: np.concatenate([x, held]),
         )
 
     def node_stiffness(self, twin: Twin) -> np.ndarray:
-        """Geometric mean of the stiffness of each node's object springs [N], N; the median of all for a node without any."""
+        """Return the geometric mean stiffness of each node's object springs [N], N; without springs, the median of all."""
         count = twin.topology.object_spring_count
         pairs, values = twin.topology.springs[:count], np.maximum(twin.material.stiffness[:count].astype(float), 1e-30)
         nodes = len(twin.topology.nodes)

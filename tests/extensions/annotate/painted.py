@@ -23,7 +23,7 @@ class Painted:
 
     def fill(self, marks, size):
         if not marks:
-            raise InputError("frame", "an object or a hand must be marked on it")
+            raise InputError("frame", "an object or a hand must be annotated in it")
         labels = np.zeros(size, np.uint8)
         for mark in marks:
             (x0, y0), (x1, y1) = np.round(np.sort(mark.points, axis=0)).astype(int)[[0, -1]]

@@ -30,7 +30,7 @@ class Page:
         return self.browser.run(f"document.querySelector({json.dumps(selector)}).textContent")
 
     def saved(self):
-        self.shown("#saved", "Marks saved")
+        self.shown("#saved", "Annotations saved")
 
     def marks(self, camera="0"):
         return self.client.get("/api/masks")["marks"]["cameras"].get(camera, [])
@@ -128,7 +128,7 @@ def test_frames_and_cameras_are_reached_by_keys(page):
     assert page.browser.run("annotate.view.showOverlay") is False
     page.browser.key("k")
     page.browser.run("annotate.go(4)")
-    page.shown("#hint", "This camera missed this frame.")
+    page.shown("#hint", "This camera did not record this frame.")
 
 
 def test_marks_are_previewed_carried_with_progress_and_saved(page, painted, capture):
@@ -160,7 +160,7 @@ def test_an_error_is_shown_in_the_page(page):
     page.shown("#messages", "")
 
 
-@pytest.mark.parametrize(("choice", "left"), [("Take theirs", 1), ("Keep mine", 2)])
+@pytest.mark.parametrize(("choice", "left"), [("Load that version", 1), ("Keep mine", 2)])
 def test_two_tabs_do_not_write_over_each_other_unasked(page, choice, left):
     page.drag((10, 12), (50, 42))
     page.saved()
@@ -168,7 +168,7 @@ def test_two_tabs_do_not_write_over_each_other_unasked(page, choice, left):
     other = {"format": 1, "cameras": {"0": [theirs["marks"]["cameras"]["0"][0] | {"frame": 7}]}}
     assert page.client.post("/api/marks", revision=theirs["revision"], marks=other)[0] == 200
     page.drag((60, 12), (90, 42))
-    page.told("changed in another tab or program")
+    page.told("Another tab or program changed the annotations")
     assert page.marks()[0]["frame"] == 7
     page.press(choice)
     page.saved()
@@ -179,7 +179,7 @@ def test_a_lost_server_is_told_and_the_change_is_kept(page):
     page.browser.online(False)
     page.drag((10, 12), (50, 42))
     page.told("The server does not answer")
-    page.shown("#saved", "Marks NOT saved")
+    page.shown("#saved", "Annotations NOT saved")
     assert page.browser.run("document.querySelectorAll('#marks li').length") == 1
     page.browser.online(True)
     page.press("Try again")

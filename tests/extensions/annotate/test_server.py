@@ -45,7 +45,7 @@ def test_marks_are_saved_at_each_change_and_a_stale_tab_is_refused(client, captu
     first = write_marks(client, BOX)
     assert json.loads((capture.folder / "marks.json").read_text()) == marks(BOX)
     status, answer = client.post("/api/marks", revision="none", marks=marks())
-    assert (status, answer["error"]) == (409, "The file changed in another tab or program since this page read it.")
+    assert (status, answer["error"]) == (409, "Another tab or program changed the file after this page read it.")
     assert client.get("/api/masks")["marks"] == marks(BOX)
     assert client.post("/api/marks", revision=first, marks=marks(BOX, HAND))[0] == 200
 
@@ -54,7 +54,7 @@ def test_marks_that_break_a_rule_are_refused_and_change_nothing(client, capture)
     status, answer = client.post("/api/marks", revision="none", marks={"format": 2})
     assert (status, "format" in answer["error"]) == (422, True)
     status, answer = client.post("/api/marks", revision="none", marks=marks(*[BOX] * 2001))
-    assert (status, "at most 2000 marks a camera; received 2001" in answer["error"]) == (422, True)
+    assert (status, "a camera must have at most 2000 annotations; received 2001" in answer["error"]) == (422, True)
     assert not (capture.folder / "marks.json").exists()
 
 
@@ -67,7 +67,7 @@ def test_the_preview_shows_the_marks_of_the_frame(client):
     assert tuple(picture[60, 90, 2::-1]) == LABEL_COLORS[2]
     assert picture[10, 10, 3] == 0
     status, answer = client.post("/api/preview", camera="0", frame=0)
-    assert (status, "must be marked on it" in answer["error"]) == (422, True)
+    assert (status, "must be annotated in it" in answer["error"]) == (422, True)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_marks_are_carried_looked_at_and_saved(client, capture):
     masks = client.get("/api/masks")
     assert masks["carried"]["0"]["doubt"] == pytest.approx(np.linspace(0, 1, FRAMES), abs=1e-3)
     assert (masks["carried"]["0"]["stale"], masks["carried"]["0"]["saved"]) == (False, False)
-    assert masks["job"]["message"] == "Carried camera 0; 6 very doubtful frames. Look at the frames that are listed, then save."
+    assert masks["job"]["message"] == "Carried camera 0; 6 very doubtful frames. Check the listed frames, then save."
     assert (client.image("/api/overlay/carried/0/2")[..., 3] > 0).sum() == 21 * 21
     assert client.raw("GET", "/api/overlay/carried/0/4")[0] == 404
     status, answer = client.post("/api/masks/save")
@@ -105,7 +105,7 @@ def test_one_thing_is_carried_at_a_time_and_can_be_stopped(client, painted):
     job = client.wait(lambda: (job := client.get("/api/job"))["done"] == 1 and job)
     assert (job["state"], job["what"], job["total"]) == ("running", "camera 0", FRAMES)
     status, answer = client.post("/api/carry", cameras=["0"])
-    assert (status, "Wait for the end, or stop it" in answer["error"]) == (409, True)
+    assert (status, "Wait for its end, or stop it" in answer["error"]) == (409, True)
     assert client.post("/api/stop")[0] == 200
     painted.gate.set()
     client.wait(lambda: client.get("/api/job")["state"] == "stopped")

@@ -1,6 +1,6 @@
-"""The commands of the page's tutorial run as they stand there, in their order, on frames as a camera writes them.
+"""The steps of the page on own videos run as printed and in order, on frames as a camera writes them.
 
-What a user does in the browser is done by a stand-in: it draws an outline of the object and a line along the hand.
+A stand-in for the user draws an outline of the object and a line along the hand.
 """
 
 import json
@@ -21,32 +21,20 @@ from neuspring.perception.marks import MARKS, Mark, Marks
 from tests.support.filmed import film
 from tests.support.project import copy_workflow
 
-PAGE = files("neuspring.perception").joinpath("README.md").read_text()
-STEPS = re.split(r"^## \d+\. ", PAGE.split("\n## What to know")[0], flags=re.MULTILINE)[1:]
-"""Each step of the tutorial: its title and text."""
+PAGE = files("neuspring.extensions.own_video").joinpath("README.md").read_text()
 SIZE = (240, 160)
 OUTLINE = 2.0
 """How far, pixels, the drawn outline may be off."""
 
 
-def step(title):
-    """The step with this title."""
-    [found] = [step for step in STEPS if step.startswith(title)]
-    return found
-
-
-def blocks(text):
-    """What stands in a step between fences."""
-    return re.findall(r"```\n(.*?)```", text, re.DOTALL)
-
-
-def shown(title):
-    """The commands of a step, in words; a backslash at the end of a line continues it."""
-    return [shlex.split(line) for block in blocks(step(title)) for line in block.replace("\\\n", " ").splitlines()]
+def shown():
+    """The commands of the last section, in words; a backslash at the end of a line continues it."""
+    block = re.findall(r"```\n(.*?)```", PAGE, re.DOTALL)[-1]
+    return [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
 
 
 def camera_files(folder):
-    """What step 1 of the page asks for: color and depth (mm) as numbered PNG, rig.json; returns the film with its true masks."""
+    """Write the files of the page: color and depth (mm) as numbered PNG, rig.json; returns the video with its true masks."""
     filmed = film(folder / "film", cameras=1, sizes=[SIZE])
     for kind in ("color", "depth"):
         (folder / "FILES" / kind).mkdir(parents=True)
@@ -56,7 +44,8 @@ def camera_files(folder):
             assert cv2.imwrite(str(folder / "FILES" / kind / f"{frame:06d}.png"), image)
     k = filmed.cameras["0"].intrinsics
     lens = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "width": SIZE[0], "height": SIZE[1]}
-    stated = {"frame_rate": 30, "depth_unit": 0.001, "poses": "table", "cameras": [lens | {"distortion_model": "none"}]}
+    stated = json.loads(re.search(r"`(\{.*\})`", PAGE)[1])
+    stated["cameras"][0] |= lens
     (folder / "FILES" / "rig.json").write_text(json.dumps(stated))
     return filmed
 
@@ -77,7 +66,7 @@ def draw(folder, mask):
 
 @pytest.fixture(scope="module")
 def followed(tmp_path_factory):
-    """The project's folder after steps 1 to 6, with what they said."""
+    """The project's folder after the steps before the workflow, with their output."""
     project = copy_workflow(tmp_path_factory.mktemp("tutorial") / "project")
     filmed = camera_files(project)
     said = {}
@@ -85,29 +74,18 @@ def followed(tmp_path_factory):
         patch.chdir(project)
         patch.delenv("DISPLAY", raising=False)
         patch.setattr(Server, "serve_forever", lambda _: draw(project / "captures" / "my_toy", filmed.mask("0", 0)))
-        for title in ("Make a capture", "Check it", "Mark object and hands"):
-            for number, words in enumerate(shown(title)):
-                assert words[0] == ".venv/bin/neuspring"
-                with redirect_stdout(StringIO()) as stream:
-                    status = main(words[1:])
-                said[f"{title} {number}"] = stream.getvalue()
-                assert status == 0, stream.getvalue()
+        for program, *words in shown()[:-1]:
+            assert program == ".venv/bin/neuspring"
+            with redirect_stdout(StringIO()) as stream:
+                status = main(words)
+            said[words[0]] = stream.getvalue()
+            assert status == 0, stream.getvalue()
     return project, filmed, said
 
 
 def test_every_step_is_tried_here():
-    """A step that is added, or a command in another place, must be tried too."""
-    tried = ("Make a capture", "Check it", "Mark object and hands", "Ask what it costs")
-    tried += ("Look at what was perceived", "Make the twin")
-    assert tuple(step.split("\n")[0] for step in STEPS if blocks(step)) == tried
-    assert [words[1] for words in shown("Mark object and hands")] == ["annotate", "mask", "check-data"]
-
-
-def test_the_last_command_is_the_one_that_was_planned_and_begun():
-    """It takes minutes, and is tried in its parts: perception below, the dry run and the rest in tests/dag."""
-    [asked], [look], [made] = (shown(title) for title in ("Ask what it costs", "Look at what was perceived", "Make the twin"))
-    assert asked == [*made, "--dry-run"]
-    assert look == [*made, "--until", "perceive"]
+    """The workflow takes minutes, and is tried in its parts: the dry run and the rest in tests/dag."""
+    assert [words[1] for words in shown()] == ["make-capture", "annotate", "mask", "check-data", "--profile"]
 
 
 def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
@@ -116,12 +94,11 @@ def test_the_capture_is_what_was_filmed_and_the_masks_are_right(followed):
     assert capture.frame_count == filmed.frame_count
     height = capture.cameras["0"].camera_to_world[2, 3] - filmed.cameras["0"].camera_to_world[2, 3]
     assert abs(height) < 2e-3
-    assert "table: " in said["Make a capture 0"] and "depth: " in said["Make a capture 0"]
-    assert "0 errors" in said["Check it 0"] and "neuspring annotate captures/my_toy" in said["Check it 0"]
-    assert "Annotate captures/my_toy at http://127.0.0.1:" in said["Mark object and hands 0"]
-    assert "look at captures/my_toy/mask_0.png" in said["Mark object and hands 1"]
+    assert "table: " in said["make-capture"] and "depth: " in said["make-capture"]
+    assert "Annotate captures/my_toy at http://127.0.0.1:" in said["annotate"]
+    assert "captures/my_toy/mask_0.png" in said["mask"]
     assert (capture.folder / "mask_0.png").exists()
-    assert "0 errors" in said["Mark object and hands 2"] and "no masks yet" not in said["Mark object and hands 2"]
+    assert "0 errors" in said["check-data"] and "no masks yet" not in said["check-data"]
     for frame in range(capture.frame_count):
         for label in (OBJECT, HANDS):
             ours, true = (masks.mask("0", frame) == label for masks in (capture, filmed))

@@ -183,7 +183,7 @@ def test_an_object_above_the_horizon_is_refused():
     labels[:5] = OBJECT
     level = camera(np.zeros(3)).camera_to_world.copy()
     level[:3, :3] = np.stack([[1, 0, 0], [0, 0, -1], [0, 1, 0]], axis=1)
-    with pytest.raises(InputError, match="must look at the table"):
+    with pytest.raises(InputError, match="must meet the table"):
         FirstFrame.of(capture_of("cloth", view=replace(camera(np.zeros(3)), camera_to_world=level)), labels)
     with pytest.raises(InputError, match="must be in view"):
         FirstFrame.of(capture_of("cloth"), 0 * labels)

@@ -113,10 +113,10 @@ def test_a_mark_corrects_what_was_carried():
 @pytest.mark.parametrize(
     ("marks", "message"),
     [
-        ([], "an object must be marked in one frame or more; received 0"),
-        (SQUARE[1:], "an object must be marked"),
-        ([mark("object", "click", [(500, 5)])], "must lie in the image of 112 x 72 pixels"),
-        ([mark("object", "click", [(5, 5)], frame=99)], "must lie below 3"),
+        ([], "an object must be annotated in at least one frame; received 0"),
+        (SQUARE[1:], "an object must be annotated"),
+        ([mark("object", "click", [(500, 5)])], "must be inside the image of 112 x 72 pixels"),
+        ([mark("object", "click", [(5, 5)], frame=99)], "must be below 3"),
     ],
 )
 def test_marks_that_carry_nothing_are_refused(marks, message):
@@ -125,5 +125,5 @@ def test_marks_that_carry_nothing_are_refused(marks, message):
 
 
 def test_a_frame_without_marks_has_no_mask_of_its_own():
-    with pytest.raises(InputError, match="frame 1: an object or a hand must be marked on it"):
+    with pytest.raises(InputError, match="frame 1: an object or a hand must be annotated in it"):
         frame_mask(painted(2), 1, SQUARE)

@@ -1,10 +1,15 @@
 """Results folders of a tiny rope, as the workflow leaves them, for tests of exports."""
 
 import json
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+import neuspring.extensions.exports
 from neuspring.core.artifacts import Material, Simulation, Topology, Twin
 from neuspring.core.records import Recorder
 from neuspring.extensions.exports.formats import npz
@@ -14,6 +19,7 @@ from tests.support import scenarios
 
 NODES, FRAMES = 6, 7
 SPACING = 0.02
+PAGE = Path(neuspring.extensions.exports.__file__).with_name("README.md")
 
 
 def rope(**simulation):
@@ -118,3 +124,10 @@ def described(folder):
 def stretched(twin, factor):
     """The twin with other rest lengths, so that it swings from the start."""
     return replace(twin, topology=replace(twin.topology, rest_lengths=twin.topology.rest_lengths * factor))
+
+
+def run_page_script(index, folder):
+    """Run a Python script of the page, 0 for npz or 1 for MuJoCo, on an exported folder; returns what it prints."""
+    script = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[index]
+    assert "neuspring." not in script and "import neuspring" not in script
+    return subprocess.run([sys.executable, "-I", "-c", script, str(folder)], capture_output=True, text=True, check=True).stdout

@@ -1,15 +1,11 @@
 """Plain files: npz and JSON, simulated without us by the script on the page, and PLY, read back by plyfile bit for bit."""
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import neuspring.extensions.exports
 from neuspring.cli.main import main
 from neuspring.core.artifacts import Twin
 from neuspring.extensions.exports.formats import npz
@@ -17,16 +13,8 @@ from neuspring.extensions.exports.source import read_source
 from neuspring.splats.model import Splats
 from tests.extensions.exports import exported
 
-PAGE = Path(neuspring.extensions.exports.__file__).with_name("README.md")
 ERROR = 2e-7
 """m, of the script on the page to our rollout in float32. Measured: 2.4e-8."""
-
-
-def script():
-    """The Python script on the page."""
-    (found,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert "neuspring." not in found and "import neuspring" not in found
-    return found
 
 
 @pytest.mark.parametrize(
@@ -37,10 +25,7 @@ def script():
 def test_the_script_on_the_page_simulates_the_first_frame(tmp_path, options):
     folder = exported.run_folder(tmp_path, exported.stretched(exported.rope(**options), 1.1))
     assert main(["export", str(folder), "--to", "npz", "--output", str(tmp_path / "out")]) == 0
-    path = tmp_path / "first_frame.py"
-    path.write_text(script())
-    run = subprocess.run([sys.executable, "-I", str(path), str(tmp_path / "out")], capture_output=True, text=True, check=True)
-    assert float(run.stdout.split()[-1]) < ERROR
+    assert float(exported.run_page_script(0, tmp_path / "out").split()[-1]) < ERROR
     arrays = np.load(tmp_path / "out" / npz.ARRAYS_FILE)
     assert np.abs(arrays["positions"][1] - arrays["positions"][0]).max() > 100 * ERROR, "the body moves"
     if "gravity" in options:

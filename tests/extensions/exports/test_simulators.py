@@ -1,8 +1,6 @@
 """Newton and MuJoCo: their rollouts of the exported models against ours, with the same time step, and where they must differ."""
 
 import importlib.util
-import itertools
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -42,29 +40,16 @@ def test_newton_swings_as_we_do(tmp_path, options):
 
 
 def test_the_hands_are_needed_from_the_start(tmp_path):
-    with pytest.raises(InputError, match="Take 0:STOP"):
+    with pytest.raises(InputError, match="Give 0:STOP"):
         newton_format.write(swinging(tmp_path), [2, 3], tmp_path / "out")
 
 
 def by_mujoco(source, folder):
-    """Positions [F, N, 3] by MuJoCo of what is exported, as the page says."""
-    mujoco = pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
+    """Positions [F, N, 3] by the script of the page for MuJoCo."""
+    pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
     mujoco_format.write(source, range(len(source.positions)), folder)
-    model = mujoco.MjModel.from_xml_path(str(folder / "twin.xml"))
-    data = mujoco.MjData(model)
-    if model.nkey:
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-    arrays = np.load(folder / "arrays.npz")
-    settings = json.loads((folder / "description.json").read_text())["settings"]
-    substeps, hands = settings["substeps"]["value"], arrays["hands"].astype(float)
-    frames = [arrays["nodes"]]
-    for begin, end in itertools.pairwise(hands):
-        for step in range(substeps):
-            data.mocap_pos[:] = begin + (end - begin) * (step + 1) / substeps
-            mujoco.mj_step(model, data)
-        mujoco.mj_kinematics(model, data)
-        frames.append(data.xpos[1 : 1 + len(arrays["nodes"])].copy())
-    return np.stack(frames)
+    exported.run_page_script(1, folder)
+    return np.load(folder / "mujoco.npy")
 
 
 def test_without_drag_and_ground_mujoco_swings_as_we_do(tmp_path):

@@ -67,7 +67,7 @@ def test_every_format_holds_the_mass_of_the_capture_or_the_given_one(tmp_path, c
     folder, out = exported.run_folder(tmp_path / "results", with_splats=False, change=weighed(known)), tmp_path / "out"
     for to, output in (("npz", "plain"), ("mujoco", "mujoco"), ("usd", "twin.usda")):
         assert main(["export", str(folder), "--to", to, "--output", str(out / output), *given]) == 0
-    assert capsys.readouterr().out.count("Mass: 0.35 kg in all\n") == 3
+    assert capsys.readouterr().out.count("Mass: 0.35 kg in all\nNext: ") == 3
     described, arrays, _ = exported.described(out / "plain")
     assert described["mass"]["value"] == pytest.approx(TOTAL, rel=1e-6)
     stage = usd.Stage.Open(str(out / "twin.usda"))
@@ -134,20 +134,23 @@ BROKEN = {
     "no folder": (shutil.rmtree, "no such file or folder"),
     "empty folder": (
         lambda folder: [path.unlink() for path in folder.iterdir()],
-        "must be the run of a method that makes a twin; received none",
+        "must be the run of a method that fits a twin; received none",
     ),
-    "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and run again"),
-    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "the record of its model must lie in"),
+    "no twin": (lambda folder: (folder / "twin.npz").unlink(), "Delete .*fit.json and rerun the command"),
+    "no record of the twin": (lambda folder: (folder / "fit.json").unlink(), "the record of its model must be in"),
     "no observations": (
         lambda folder: (folder.parents[1] / "observations.npz").unlink(),
-        "the observations of the run must be there",
+        "the observations of the run must exist",
     ),
-    "other observations": (other_observations, "Run the workflow again"),
+    "other observations": (other_observations, "Rerun the workflow"),
     "diverged": (diverged, "diverged: node 1 left.*name .*twin.npz"),
     "failed": (failed_fit, "a failure: all candidates diverged"),
     "baseline": (baseline, "a baseline's model"),
     "older": (older, "this version reads records of format"),
-    "not a twin": (lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"), "Delete .*fit.json and run again"),
+    "not a twin": (
+        lambda folder: shutil.copy(folder / "trajectory.npz", folder / "twin.npz"),
+        "Delete .*fit.json and rerun the command",
+    ),
 }
 
 

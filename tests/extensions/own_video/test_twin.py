@@ -100,7 +100,7 @@ def test_a_second_call_does_what_is_left(film, steps, capsys):
     assert steps.names == ["check-data", "--snakefile"], "the workflow passes over what it has"
     steps.ran = []
     assert with_masks(film, "--mass", "2") == 2
-    assert "its capture was made with no --mass; received --mass 2.0. Leave" in capsys.readouterr().err and not steps.ran
+    assert "the existing capture, made with no --mass; received --mass 2.0. Omit" in capsys.readouterr().err and not steps.ran
 
 
 def test_a_second_call_takes_options_from_the_first(film, steps, capsys):
@@ -117,7 +117,7 @@ def test_the_longest_constant_grip_is_taken_or_another_window(film, steps, capsy
     steps.said = NOTE
     assert with_masks(film) == 0
     assert steps.names[:4] == ["make-capture", "mask", "check-data", "cut-capture"]
-    assert 'scenarios=["out_0-2"]' in " ".join(steps.ran[-1]) and "Frames 0-2 are learned from" in capsys.readouterr().out
+    assert 'scenarios=["out_0-2"]' in " ".join(steps.ran[-1]) and "learns from frames 0-2" in capsys.readouterr().out
     assert with_masks(film, "--window", "all") == 0
     assert 'scenarios=["out"]' in " ".join(steps.ran[-1])
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
@@ -149,7 +149,7 @@ def test_the_page_is_served_until_masks_are_saved(saves, film, steps, capsys, mo
     monkeypatch.setattr(chain, "GRACE", 0.0)
     assert twin(film) == (0 if saves else 2)
     assert ("--snakefile" in steps.names) == saves
-    assert ("the page ended before masks were saved" in capsys.readouterr().err) == (not saves)
+    assert ("the annotation page ended before masks were saved" in capsys.readouterr().err) == (not saves)
 
 
 @pytest.mark.parametrize(
@@ -157,8 +157,8 @@ def test_the_page_is_served_until_masks_are_saved(saves, film, steps, capsys, mo
     [
         (["--mass", "0"], "--mass: must be a positive number of kg; received 0"),
         (["--mass", "-1"], "--mass: must be a positive number of kg; received -1"),
-        (["--window", "12"], "--window: a first and a last frame are required"),
-        (["--masks", "/nowhere"], "what --masks, --hands and --marks name must exist"),
+        (["--window", "12"], "--window: must be a first and a last frame"),
+        (["--masks", "/nowhere"], "paths of --masks, --hands and --marks must exist"),
     ],
 )
 def test_bad_input_costs_nothing(words, message, film, steps, capsys):
@@ -172,7 +172,7 @@ def test_an_effort_that_is_none_and_a_film_that_is_not_there(film, steps, capsys
         twin(film, "--effort", "huge")
     assert ended.value.code == 2 and "huge" in capsys.readouterr().err
     assert twin(film / "nothing") == 2
-    assert "nothing there" in capsys.readouterr().err and not steps.ran
+    assert "no such path" in capsys.readouterr().err and not steps.ran
 
 
 def test_a_capture_is_taken_as_it_is(tmp_path, steps, capsys):
@@ -181,7 +181,7 @@ def test_a_capture_is_taken_as_it_is(tmp_path, steps, capsys):
     assert steps.names == ["check-data", "--snakefile"]
     assert f"data_root={tmp_path / 'here'}" in steps.ran[-1]
     assert twin(made.folder, "--mass", "0.3") == 2
-    assert 'Write "mass" into capture.json' in capsys.readouterr().err
+    assert 'Set "mass" in capture.json' in capsys.readouterr().err
 
 
 def test_the_end_names_errors_beside_static_the_page_and_how_to_play(tmp_path, capsys):

@@ -58,7 +58,7 @@ def test_a_port_in_use_and_a_place_that_is_none_are_refused(tmp_path, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["play", str(results(tmp_path)), "--port", str(port)]) == 2
-    assert "--port 0 takes any that is free" in capsys.readouterr().err
+    assert "--port 0 selects a free one" in capsys.readouterr().err
     for host, port in (("no.such.host.invalid", 0), ("127.0.0.1", 70000)):
         with pytest.raises(InputError, match=r"--host|--port"):
             start(host, port)

@@ -107,4 +107,4 @@ def test_the_command_writes_tables_growth_and_films(tmp_path, capsys, monkeypatc
     assert "7.7†" in capsys.readouterr().out
     pd.DataFrame(columns=list(SCORE_COLUMNS)).to_csv(tmp_path / "scores.csv")
     assert main([*command, *known, "--scores", str(tmp_path / "scores.csv")]) != 0
-    assert "a study of the kind clips needs a results folder" in capsys.readouterr().err
+    assert "a study of the kind clips requires a results folder" in capsys.readouterr().err

@@ -33,12 +33,12 @@ def test_all_recordings_of_a_pool_that_are_others_are_named_at_once(tmp_path):
     here, there = cable(tmp_path, 0.3), cable(tmp_path, 0.33)
     pool = [there, cable(tmp_path, 0.31), cable(tmp_path, 0.32)]
     require_pool(here, pool)
-    with pytest.raises(InputError, match=r"as many nodes and controllers.*in cable_0\.33, .* in cable_0\.31"):
+    with pytest.raises(InputError, match=r"equal numbers of nodes and controllers.*in cable_0\.33, .* in cable_0\.31"):
         require_pool(here, [replace(each, interior_points=np.zeros((2, 3)), rest_shape=np.zeros((0, 3))) for each in pool[:2]])
     # Nodes around the line are the lattice's affair: a rod follows the markers alone.
     settings = config.Config()
     fit = {"fit": settings.fit, "simulation": settings.simulation, "losses": settings.losses, "quirks": settings.released_quirks}
     twin = rod_twin(here, settings, (0.0, 1.0, 0.0))
     FitProblem(observations=here, pool=[there], twin=twin, kind="rod", **fit)
-    with pytest.raises(InputError, match="as many tracked points, controllers and vertices"):
+    with pytest.raises(InputError, match="equal numbers of tracked points, controllers and vertices"):
         FitProblem(observations=here, pool=[replace(there, line=there.line[1:])], twin=twin, kind="rod", **fit)

@@ -122,7 +122,7 @@ def test_a_space_that_cannot_be_is_refused_by_name(finished, space, words):
 
 def test_what_a_sweep_cannot_go_on_with_is_refused(finished, tmp_path):
     folder, tune = finished
-    with pytest.raises(InputError, match="a password would be shown"):
+    with pytest.raises(InputError, match="must not contain a password"):
         sweep(storage="postgresql://me:secret@host:5432/studies")
     with pytest.raises(InputError, match="does not read it"):
         Plan.of(settings(), sweep(method="search_only"), folder.parent)

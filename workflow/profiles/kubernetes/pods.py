@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Jobs of Snakemake as Jobs of Kubernetes, through kubectl: `pods.py submit SCRIPT`, `pods.py status NAME`, `pods.py NAME...`.
+"""Run Snakemake jobs as Kubernetes Jobs with kubectl: `pods.py submit SCRIPT`, `pods.py status NAME`, `pods.py NAME...`.
 
-Snakemake's cluster-generic executor calls these to submit a job, to ask for its state, and (names alone) to cancel jobs. The
-part that all jobs share is in job.yaml.
+Snakemake's cluster-generic executor calls these commands to submit a job, to query its state, and (names only) to cancel jobs.
+job.yaml is the template of all jobs.
 """
 
 import json
@@ -14,11 +14,11 @@ import yaml
 
 TEMPLATE = Path(__file__).with_name("job.yaml")
 PROPERTIES = "# properties = "
-"""Begins the line of a job's script that says what the job needs."""
+"""Start of the line in a job's script that contains the job's resources."""
 
 
 def main(arguments: list[str]) -> int:
-    """Submit, ask or cancel; returns an exit status."""
+    """Submit, query or cancel jobs; returns an exit status."""
     match arguments:
         case ["submit", script]:
             print(submit(Path(script)))
@@ -33,7 +33,7 @@ def main(arguments: list[str]) -> int:
 
 
 def submit(script: Path) -> str:
-    """Make a Job that runs `script`; returns its name."""
+    """Create a Job that runs `script`; returns its name."""
     lines = [line for line in script.read_text().splitlines() if line.startswith(PROPERTIES)]
     properties = json.loads(lines[0].removeprefix(PROPERTIES))
     name = kubectl("create", "-f", "-", "-o", "name", text=json.dumps(manifest(properties, script)))
@@ -41,15 +41,15 @@ def submit(script: Path) -> str:
 
 
 def manifest(properties: dict, script: Path) -> dict:
-    """The Job of a job with these properties."""
+    """The manifest of the Job for these properties."""
     job = yaml.safe_load(TEMPLATE.read_text())
     resources = properties["resources"]
     rule = properties.get("rule") or properties["groupid"]
     job["metadata"]["generateName"] = f"neuspring-{rule.replace('_', '-').lower()}-"
     pod = job["spec"]["template"]["spec"]
-    # Set for the pod: a Job's time limit would also count while it waits for a GPU.
+    # The time limit belongs to the pod, because a Job's time limit includes waiting for a GPU.
     pod["activeDeadlineSeconds"] = 60 * resources["runtime"]
-    # Memory is a limit too: a job that needs more fails alone, and is tried again with more.
+    # Memory is also a limit: a job that exceeds it fails without affecting others, and is retried with more memory.
     needs = {"cpu": str(properties["threads"]), "memory": f"{resources['mem_mb']}M"}
     limits = {"memory": needs["memory"]} | ({"nvidia.com/gpu": str(resources["gpu"])} if resources.get("gpu") else {})
     pod["containers"][0] |= {"command": ["/bin/sh", str(script)], "resources": {"requests": needs, "limits": limits}}
@@ -57,7 +57,7 @@ def manifest(properties: dict, script: Path) -> dict:
 
 
 def status(name: str) -> str:
-    """`running`, `success` or `failed`, as Snakemake takes it. While the cluster does not answer, a job counts as running."""
+    """The state for Snakemake: `running`, `success` or `failed`. If the cluster does not answer, a job counts as running."""
     result = subprocess.run(["kubectl", "get", "job", name, "-o", "json"], capture_output=True, text=True, check=False)
     if result.returncode != 0:
         print(result.stderr, file=sys.stderr, end="")
@@ -68,7 +68,7 @@ def status(name: str) -> str:
 
 
 def kubectl(*arguments: str, text: str | None = None) -> str:
-    """Its output. Raises CalledProcessError, after kubectl has said why."""
+    """Run kubectl and return its output. Raises CalledProcessError; kubectl prints the reason."""
     return subprocess.run(["kubectl", *arguments], input=text, stdout=subprocess.PIPE, text=True, check=True).stdout
 
 

@@ -1,4 +1,4 @@
-// Requests to the server. The token comes from the address and goes into a header, which other sites cannot send.
+// Requests to the server. The token from the address goes into a header, which other sites cannot send.
 
 const token = location.hash.slice(1) || sessionStorage.getItem("token") || "";
 sessionStorage.setItem("token", token);
@@ -21,7 +21,7 @@ async function ask(path, options = {}) {
   let text = answer.statusText;
   try {
     text = (await answer.json()).error;
-  } catch { /* not ours */ }
+  } catch { /* not a response of this server */ }
   throw new Problem(answer.status, text);
 }
 
@@ -32,7 +32,7 @@ const send = (path, values) =>
 export const post = async (path, values = {}) => (await send(path, values)).json();
 export const postForImage = async (path, values) => createImageBitmap(await (await send(path, values)).blob());
 
-// The last images, by path; as many as hold `most` pixels.
+// Cache of the latest images by path, with at most `most` pixels.
 export class Images {
   constructor(most = 60e6) {
     this.kept = new Map();

@@ -1,4 +1,4 @@
-// The page: which camera and frame are shown.
+// The page: the shown camera and frame, and the keys.
 
 import { getJson, Images } from "./api.js";
 import { MasksMode } from "./masks.js";
@@ -7,7 +7,7 @@ import { Timeline } from "./timeline.js";
 import { View } from "./view.js";
 
 const find = (id) => document.getElementById(id);
-const AHEAD = 6; // frames that are fetched before they are shown
+const AHEAD = 6; // frames to fetch in advance
 
 class App {
   constructor(state) {
@@ -31,7 +31,7 @@ class App {
     }));
     find("show-help").onclick = () => find("help").showModal();
     find("overlay").onclick = () => this.toggleOverlay();
-    // A button that was clicked gives the keys back: Space plays, and does not press it again.
+    // Release the focus of a clicked button, so that Space plays instead of pressing it again.
     document.addEventListener("click", (event) => event.detail && event.target.closest("button")?.blur());
     window.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("beforeunload", (event) => {
@@ -61,7 +61,7 @@ class App {
     return this.state.cameras.find((camera) => camera.name === name);
   }
 
-  // Show a frame; resolves when it is there. Of several calls the last one wins.
+  // Show a frame; resolves when it is drawn. The last of several calls wins.
   async go(frame, camera = this.camera) {
     const moved = camera !== this.camera || frame !== this.frame;
     this.camera = camera;
@@ -77,7 +77,7 @@ class App {
     this.refreshHint();
     if (missing.includes(this.frame)) {
       this.view.frame = this.view.overlay = null;
-      this.hint("This camera missed this frame.");
+      this.hint("This camera did not record this frame.");
       this.view.draw();
       return;
     }
@@ -108,7 +108,7 @@ class App {
     }
   }
 
-  // The overlay of this frame anew.
+  // Redraw the overlay of this frame.
   showMasks() {
     return this.go(this.frame);
   }

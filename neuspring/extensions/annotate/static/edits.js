@@ -1,10 +1,10 @@
-// A document that is kept on the server: every change is sent at once, in order, and can be undone.
+// A document on the server: each change is sent immediately, in order, and can be undone.
 
 import { getJson, post } from "./api.js";
 import { say, saved } from "./messages.js";
 
 export class Edits {
-  // `key`: its name in requests; `reread`: gives {revision, [key]} as it is on the server; `changed`: called after every change.
+  // `key`: its name in requests; `reread`: gets {revision, [key]} from the server; `changed`: called after each change.
   constructor({ key, path, reread, changed, name }) {
     Object.assign(this, { key, path, reread, changed, name });
     this.past = [];
@@ -57,29 +57,29 @@ export class Edits {
     } catch (error) {
       saved(`${this.name} NOT saved`);
       if (error.status === 409) {
-        say(`${this.name} changed in another tab or program.`, "bad", {
-          "Take theirs": () => this.takeTheirs(),
+        say(`Another tab or program changed the ${this.name.toLowerCase()}.`, "bad", {
+          "Load that version": () => this.loadStored(),
           "Keep mine": () => this.keepMine(),
         });
       } else if (error.status === 422) {
-        say(`${error.message} The change was taken back.`);
-        await this.takeTheirs();
+        say(`${error.message} The change was undone.`);
+        await this.loadStored();
       } else {
         say(error.message, "bad", { "Try again": () => this.keepMine() });
       }
     }
   }
 
-  async takeTheirs() {
+  async loadStored() {
     try {
-      const theirs = await this.reread(getJson);
-      this.take(theirs.revision, theirs[this.key]);
+      const stored = await this.reread(getJson);
+      this.take(stored.revision, stored[this.key]);
       this.past = [];
       this.future = [];
       saved(`${this.name} saved`);
       this.changed(true);
     } catch (error) {
-      say(error.message, "bad", { "Try again": () => this.takeTheirs() });
+      say(error.message, "bad", { "Try again": () => this.loadStored() });
     }
   }
 
@@ -92,7 +92,7 @@ export class Edits {
     }
   }
 
-  // Whether the server lacks something: it was not sent yet, or could not be kept.
+  // True if the server does not have the latest value.
   get dirty() {
     return this.value !== this.stored;
   }

@@ -1,4 +1,4 @@
-// Marks on frames, previews, carrying, saving.
+// Annotations of frames, previews, carrying, saving.
 
 import { getJson, post, postForImage } from "./api.js";
 import { doubtColor, HIGH, worst } from "./doubt.js";
@@ -14,8 +14,8 @@ const LABELS = { 1: "object", 2: "hand", 3: "ignore", 4: "person" };
 const HINTS = {
   box: "Drag a box around the {label}.",
   click: "Click on the {label}.",
-  scribble: "Draw over the {label}.",
-  polygon: "Click the corners around the {label}; Enter or a double click closes.",
+  scribble: "Drag a line over the {label}.",
+  polygon: "Click corners around the {label}. Close it with Enter or a double click.",
 };
 
 export class MasksMode {
@@ -31,7 +31,7 @@ export class MasksMode {
     this.edits = new Edits({
       key: "marks",
       path: "/api/marks",
-      name: "Marks",
+      name: "Annotations",
       reread: (get) => get("/api/masks"),
       changed: (sent) => this.changed(sent),
     });
@@ -56,7 +56,7 @@ export class MasksMode {
     if (state.job.state === "running") this.watch();
   }
 
-  // Marks.
+  // Annotations.
   marksOf(camera = this.app.camera) {
     return this.edits.value?.cameras[camera] ?? [];
   }
@@ -133,7 +133,7 @@ export class MasksMode {
     return this.app.images.get(`/api/overlay/${source}/${camera}/${frame}?${version}`, width * height).catch(() => null);
   }
 
-  // Which masks there are of a frame, the newest first.
+  // The newest masks of a frame: previewed, carried, saved, or null.
   source(camera, frame) {
     if (this.preview?.camera === camera && this.preview.frame === frame) return "previewed";
     if (this.results.carried[camera]) return "carried";
@@ -142,7 +142,7 @@ export class MasksMode {
 
   async carry(cameras) {
     await this.edits.sending;
-    if (!cameras.length) return say("Mark the object in a frame first: draw a box around it.");
+    if (!cameras.length) return say("Annotate the object in a frame first: draw a box around it.");
     this.results.job = await post("/api/carry", { cameras });
     this.refresh();
     return this.watch();
@@ -158,7 +158,7 @@ export class MasksMode {
         this.results.job = job;
         this.progress(job);
         await new Promise((done) => setTimeout(done, 250));
-        // Not the job's own state: another one may have begun while this waited.
+        // Not job.state: another job may have started during the wait.
       } while (this.results.job.state === "running");
     } catch (error) {
       say(error.message, "bad", { "Try again": () => this.watch() });
@@ -203,7 +203,7 @@ export class MasksMode {
   }
 
   hint() {
-    return HINTS[this.tool].replace("{label}", this.label === "ignore" ? "part to ignore" : this.label);
+    return HINTS[this.tool].replace("{label}", this.label === "ignore" ? "area to ignore" : this.label);
   }
 
   refresh() {
@@ -223,7 +223,7 @@ export class MasksMode {
     find("stale").hidden = !carried?.stale || running;
     find("doubtful").replaceChildren(...worst(this.doubt()).map(({ frame, doubt }) =>
       app.chip(frame, `${frame} · ${Math.round(100 * doubt)} %`, doubt > HIGH ? "high" : "mid")));
-    find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are sure" : "known once masks are carried";
+    find("doubtful").dataset.empty = this.doubt().length ? "none: all frames are certain" : "available after masks are carried";
     const unsaved = Object.keys(results.carried).filter((name) => !results.carried[name].saved);
     find("save-masks").disabled = running || !unsaved.length;
     const list = (names) => names.join(", ");
@@ -256,7 +256,7 @@ export class MasksMode {
     find("progress-text").textContent = job.what ? text : "starting";
   }
 
-  // Doubt of every frame, of the masks that are shown.
+  // Doubt of all frames of the shown masks.
   doubt() {
     return this.results.carried[this.app.camera]?.doubt ?? this.results.saved[this.app.camera] ?? [];
   }
@@ -286,7 +286,7 @@ export class MasksMode {
 
   nextDoubtful() {
     const list = worst(this.doubt());
-    if (!list.length) return this.app.hint("No frame is doubtful.");
+    if (!list.length) return this.app.hint("There is no doubtful frame.");
     const next = (list.findIndex((one) => one.frame === this.app.frame) + 1) % list.length;
     return this.app.go(list[next].frame);
   }

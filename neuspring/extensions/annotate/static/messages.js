@@ -1,4 +1,4 @@
-// What the page says: errors stay until they are closed, good news goes by itself.
+// Messages: errors stay until the user closes them, successes disappear after a while.
 
 const place = document.getElementById("messages");
 

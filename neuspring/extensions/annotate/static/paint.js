@@ -1,4 +1,4 @@
-// How marks look.
+// Colors and drawing of annotations.
 
 export const COLORS = {
   object: "rgb(0 200 160)", hand: "rgb(255 140 0)", ignore: "rgb(200 120 255)", person: "rgb(150 160 255)",

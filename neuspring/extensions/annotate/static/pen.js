@@ -1,8 +1,8 @@
-// Drawing a mark with the pointer: a box, a click, a scribble, a polygon.
+// Drawing an annotation with the pointer: box, click, scribble or polygon.
 
 import { drawMark } from "./paint.js";
 
-const NEAR = 9; // CSS pixels around a polygon's first corner that close it
+const NEAR = 9; // distance from a polygon's first corner at which a click closes it, CSS pixels
 
 export class Pen {
   // `mode` has tool, label, radius, add(kind, points) and the page as app.
@@ -50,7 +50,7 @@ export class Pen {
     const { kind, points } = this.drawing;
     this.drawing = null;
     if (kind === "box" && Math.min(Math.abs(points[0][0] - points[1][0]), Math.abs(points[0][1] - points[1][1])) < 2) {
-      this.app.hint("That box is too small: drag from corner to corner.");
+      this.app.hint("The box is too small. Drag from corner to corner.");
     } else this.mode.add(kind, points);
     this.app.view.draw();
   }
@@ -65,10 +65,10 @@ export class Pen {
   }
 
   close() {
-    // A double click adds its corner twice.
+    // A double click adds its corner twice; remove the copy.
     const corners = this.drawing.points.filter(([x, y], k, all) => !k || Math.hypot(x - all[k - 1][0], y - all[k - 1][1]) > 0.5);
     this.drawing = null;
-    if (corners.length < 3) this.app.hint("A polygon needs three corners or more.");
+    if (corners.length < 3) this.app.hint("A polygon needs at least three corners.");
     else this.mode.add("polygon", corners);
     this.app.view.draw();
   }

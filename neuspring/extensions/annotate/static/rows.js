@@ -1,4 +1,4 @@
-// A row of a list in the panel: a colored sign, a text, and what a click on it or on its cross does.
+// A row of a list in the panel: a colored sign, a text, and actions for clicks on the row and on its cross.
 
 export function row({ sign, text, chosen = false, pick, name = text, remove = null }) {
   const item = document.createElement("li");

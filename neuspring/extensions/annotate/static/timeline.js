@@ -1,7 +1,7 @@
-// The frame slider, the strip above it, and playing.
+// The frame slider, the strip above it, and playback.
 
 export class Timeline {
-  // `go(frame)` resolves when the frame is shown; `bars()` gives [{frame, last?, color, height 0..1}], drawn in that order.
+  // `go(frame)` resolves when the frame is shown; `bars()` gives [{frame, last?, color, height 0..1}], drawn in this order.
   constructor({ go, bars }) {
     this.go = go;
     this.bars = bars;
@@ -40,12 +40,12 @@ export class Timeline {
     this.strip.height = Math.max(1, height * ratio);
     const context = this.strip.getContext("2d");
     context.scale(ratio, ratio);
-    // The knob of a range input moves between half its width from either end.
+    // The knob of a range input stays half its width inside both ends.
     const knob = 8;
     const step = (width - 2 * knob) / Math.max(this.frames - 1, 1);
     const wide = Math.max(step, 2);
     for (const bar of this.bars()) {
-      // Whole pixels, so that neighbors leave no seam.
+      // Integer pixels, so that neighboring bars leave no gap.
       const left = Math.floor(knob + bar.frame * step - wide / 2);
       const right = Math.floor(knob + (bar.last ?? bar.frame) * step + wide / 2);
       context.fillStyle = bar.color;

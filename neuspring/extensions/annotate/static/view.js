@@ -1,5 +1,5 @@
-// The picture: a frame, masks over it, and the marks on top; zoom, shift, and pixels of the image under the pointer.
-// Pixel centers lie at whole coordinates, so that a pixel covers half a unit to each side.
+// The canvas: a frame, its masks, and annotations on top; zoom, pan, and conversion between pointer and image coordinates.
+// Pixel centers are at integer coordinates, so a pixel covers half a unit on each side.
 
 export class View {
   constructor(canvas) {
@@ -8,7 +8,7 @@ export class View {
     this.frame = null;
     this.overlay = null;
     this.showOverlay = true;
-    this.mode = null; // has paint(context, view) and down, move, up, hover, double (image point, event)
+    this.mode = null; // has paint(context, view), and down, move, up, hover, double with (image point, event)
     this.scale = 1;
     this.origin = [0, 0];
     this.fitted = true;

@@ -1,1 +1,1 @@
-"""One file a format, named after it: its `export`."""
+"""One module per format, with its variable `export`."""

@@ -1,4 +1,4 @@
-"""MuJoCo: an MJCF file, beside the plain export for the hands' motion."""
+"""MuJoCo: an MJCF file, and the files of the format `npz` with the motion of the controllers."""
 
 from __future__ import annotations
 
@@ -18,47 +18,47 @@ from neuspring.twin.rollout import FAR_AWAY
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 MODEL = "twin.xml"
 GROUND_TIME = 4
-"""Time constant of contacts with the ground, in time steps; MuJoCo takes 2 or more."""
+"""Time constant of contacts with the ground, in time steps; MuJoCo requires 2 or more."""
 
 
 def text(*values: float | np.floating) -> str:
-    """Numbers as MJCF has them; float32 to the last bit."""
+    """Numbers for MJCF, which keep every bit of a float32."""
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
-    """Write twin.xml, and arrays.npz and description.json for the hands' motion, to the folder `output`."""
+    """Write twin.xml, arrays.npz and description.json to the folder `output`."""
     require_start(frames)
     write_text(output / MODEL, mjcf(source))
     return [output / MODEL, *npz.write(source, frames, output)]
 
 
 def mjcf(source: ExportSource) -> str:
-    """Nodes as bodies on three slides, springs as spatial tendons, controllers as mocap bodies, with our time step.
+    """MJCF: nodes are bodies on three slides, springs spatial tendons, controllers mocap bodies; the time step is the twin's.
 
-    A tendon's force is stiffness (l - springlength) + damping dl/dt, so it is our spring with stiffness / rest length. One that
-    only pushes has no stiffness beyond its rest length; its damping stays. Slides damp as our drag does.
-    Bodies and sites are node0, node1, ..., hand0, ..., tendons spring0, ...
+    - A tendon has the force stiffness (l - springlength) + damping dl/dt: a spring of the twin, divided by its rest length.
+    - A tendon that only pushes has no stiffness beyond its rest length, but keeps its damping.
+    - Slides have the damping of the twin's drag.
+    - Bodies and sites are called node0, node1, ..., hand0, ...; tendons spring0, ...
 
-    Of two geoms of equal priority MuJoCo takes the greater friction (1.0 where none is given) and the mean solref, so that of the
-    ground acts by priority alone. It is as hard as the time step allows. The cone of friction is round, since the pyramid that is
-    MuJoCo's default brakes otherwise along the diagonals.
+    For two geoms of equal priority MuJoCo uses the larger friction (1.0 by default) and the mean solref, so the ground has a
+    higher priority. Its contacts are as hard as the time step allows. Friction has an elliptic cone, because MuJoCo's default
+    pyramid brakes differently along the diagonals.
 
-    A package writes its body itself (`BODY_EXPORTS`): bodies that carry a site per node, and the longest time step.
+    Other bodies are written by their package (`BODY_EXPORTS`): MuJoCo bodies with one site per node, and a maximum time step.
     """
     twin = source.twin
     simulation, material, topology = twin.simulation, twin.material, twin.topology
-    radius = material.contact_distance / 2
     root = ET.Element("mujoco", model=source.name)
-    gravity = (0, 0, -simulation.gravity * simulation.up_sign)
     write_body = of_body(twin, "mujoco")
-    own = write_body(twin) if write_body else None
-    radius = own.radius if own else radius
-    step, integrator = (min(simulation.substep, own.step), "implicitfast") if own else (simulation.substep, "Euler")
-    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=text(*gravity), cone="elliptic")
+    chain = write_body(twin) if write_body else None
+    radius = chain.radius if chain else material.contact_distance / 2
+    step, integrator = (min(simulation.substep, chain.step), "implicitfast") if chain else (simulation.substep, "Euler")
+    gravity = text(0, 0, -simulation.gravity * simulation.up_sign)
+    ET.SubElement(root, "option", timestep=text(step), integrator=integrator, gravity=gravity, cone="elliptic")
     world = ET.SubElement(root, "worldbody")
     if simulation.ground:
-        # Nodes are points for us and balls here, which touch a plane that is lower by their radius.
+        # The twin's nodes are points and MuJoCo's are balls, so the plane is lower by their radius.
         height, turn = -radius * simulation.up_sign, "0 0 0" if simulation.up == "+z" else "180 0 0"
         friction = text(material.ground_friction, 0.005, 0.0001)
         kind: dict[str, Any] = {"type": "plane", "size": "5 5 0.1", "contype": "1", "conaffinity": "0", "friction": friction}
@@ -67,17 +67,17 @@ def mjcf(source: ExportSource) -> str:
     # The plane meets nodes; nodes meet each other only with self-collision.
     meets: dict[str, Any] = {"contype": "1" if simulation.self_collision else "0", "conaffinity": "1"}
     meets["friction"] = text(material.contact_friction, 0.005, 0.0001)
-    if own:
-        own.add(root, world, meets)
-    for index, (place, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not own else ()):
-        body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*place))
+    if chain:
+        chain.add(root, world, meets)
+    for index, (position, mass) in enumerate(zip(topology.nodes, source.masses, strict=True) if not chain else ()):
+        body = ET.SubElement(world, "body", name=f"node{index}", pos=text(*position))
         for axis, direction in AXES.items():
             damping = text(material.drag * float(mass))
             ET.SubElement(body, "joint", name=f"node{index}{axis}", type="slide", axis=direction, damping=damping)
         ET.SubElement(body, "geom", type="sphere", size=text(radius), mass=text(mass), **meets)
         ET.SubElement(body, "site", name=f"node{index}", size=text(radius))
-    for index, place in enumerate(topology.controllers):
-        body = ET.SubElement(world, "body", name=f"hand{index}", pos=text(*place), mocap="true")
+    for index, position in enumerate(topology.controllers):
+        body = ET.SubElement(world, "body", name=f"hand{index}", pos=text(*position), mocap="true")
         ET.SubElement(body, "site", name=f"hand{index}", size=text(radius), rgba="1 0.6 0.1 1")
     tendons = ET.SubElement(root, "tendon") if len(topology.springs) else root
     names = [f"node{index}" for index in range(len(topology.nodes))] + [f"hand{c}" for c in range(len(topology.controllers))]
@@ -85,16 +85,20 @@ def mjcf(source: ExportSource) -> str:
     columns = (topology.springs, material.stiffness, topology.rest_lengths, material.dashpot, pushes)
     for index, (ends, stiffness, length, dashpot, push) in enumerate(zip(*columns, strict=True)):
         force = text(float(stiffness) / float(length))
-        # Between two lengths a tendon has no force.
+        # A tendon has no force between its two spring lengths.
         free = text(length, FAR_AWAY) if push else text(length)
         law: dict[str, Any] = {"stiffness": force, "damping": text(dashpot), "springlength": free}
         tendon = ET.SubElement(tendons, "spatial", name=f"spring{index}", width=text(radius / 5), **law)
         for end in ends:
             ET.SubElement(tendon, "site", site=names[end])
-    if not own and source.velocity.any():
+    if not chain and source.velocity.any():
         ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="start", qvel=text(*source.velocity.ravel()))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-export = Export(write=write, name="{name}_mujoco")
+export = Export(
+    write=write,
+    name="{name}_mujoco",
+    then="Next: copy run.py from MuJoCo in neuspring/extensions/exports/README.md, then .venv/bin/python run.py {output}",
+)

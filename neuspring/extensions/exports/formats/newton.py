@@ -1,4 +1,4 @@
-"""Newton: a script that makes its model of a twin, beside the plain export."""
+"""Newton: a script that builds and simulates a model of Newton, and the files of the format `npz`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ SCRIPT = Path(__file__).parents[1] / "newton_twin.py"
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
     """Write arrays.npz, description.json and newton_twin.py to the folder `output`."""
     require_start(frames)
-    springs = source.twin.topology
-    if springs.pushes.any():
-        rule = "Newton's springs pull as well as push"
-        raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Take --to mujoco or npz.")
+    if source.twin.topology.pushes.any():
+        rule = "Newton has no springs that only push"
+        raise InputError("--to newton", rule, f"{source.name}, whose hands only push", "Use --to mujoco or npz.")
     of_body(source.twin, "newton")
-    made = [output / SCRIPT.name]
-    write_text(output / SCRIPT.name, SCRIPT.read_text(encoding="utf-8"))
-    return [*npz.write(source, frames, output), *made]
+    script = output / SCRIPT.name
+    write_text(script, SCRIPT.read_text(encoding="utf-8"))
+    return [*npz.write(source, frames, output), script]
 
 
-export = Export(write=write, name="{name}_newton")
+export = Export(
+    write=write,
+    name="{name}_newton",
+    then="Next: PYTHONPATH={output} .venv/bin/python -c \"import newton_twin; print(newton_twin.simulate('{output}', 10))\"",
+)

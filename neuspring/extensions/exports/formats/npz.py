@@ -1,4 +1,4 @@
-"""npz + JSON: every array and setting of a twin, described well enough to be read and simulated without this project."""
+"""npz and JSON: every array and setting of a twin, with a description that suffices to simulate it without NeuSpring."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neuspring.twin.body import body_of
 ARRAYS_FILE, DESCRIPTION_FILE = "arrays.npz", "description.json"
 SIZE_MEANINGS = {
     "N": "nodes",
-    "C": "controllers: points that are moved from outside, as hands or grippers",
+    "C": "controllers: tracked points that move the object, for example on hands or grippers",
     "S": "springs",
     "R": "nodes, then controllers",
     "B": "springs",
@@ -32,23 +32,23 @@ SIZE_MEANINGS = {
 EXPORTED_SETTINGS = {
     "frame_time": ("s", "simulated time per frame"),
     "substeps": ("1", "steps per frame"),
-    "gravity": ("m/s^2", "acceleration downwards"),
+    "gravity": ("m/s^2", "downward acceleration"),
     "up_sign": ("1", "1: +z is up; -1: -z is up"),
     "ground": ("1", "whether the plane z = 0 is the ground"),
     "self_collision": ("1", "whether nodes collide with each other"),
-    "controller_velocity": ("1", "whether dashpots see the velocity of controllers"),
+    "controller_velocity": ("1", "whether dashpots include the velocity of controllers"),
 }
 EXPORTED_SETTINGS |= {
     spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in dataclasses.fields(Material) if spec.name in SCALARS
 }
 MOTION = {
-    "frame": ("F", "1", "number of the frame; frame 0 is where the motion starts"),
-    "time": ("F", "s", "since frame 0"),
-    "positions": ("F,N,3", "m", "predicted nodes"),
-    "hands": ("F,C,3", "m", "controllers"),
+    "frame": ("F", "1", "frame number; the motion starts in frame 0"),
+    "time": ("F", "s", "time since frame 0"),
+    "positions": ("F,N,3", "m", "predicted positions of the nodes"),
+    "hands": ("F,C,3", "m", "positions of the controllers"),
     "holds": ("F,C", "1", "whether each controller holds the object"),
-    "velocity": ("N,3", "m/s", "of the nodes in frame 0"),
-    "mass": ("N", "kg", "of each node"),
+    "velocity": ("N,3", "m/s", "velocities of the nodes in frame 0"),
+    "mass": ("N", "kg", "mass of each node"),
 }
 
 
@@ -66,9 +66,9 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
         settings |= {spec.name: (spec.metadata["unit"], spec.metadata["doc"]) for spec in numbers}
         values |= {spec.name: float(getattr(part, spec.name)) for spec in numbers}
     text = {
-        # A reader of one body's format would simulate another as that body.
+        # Each body has its own format, so that no reader simulates one body as another.
         "format": body.format,
-        # Who does not know springs that only push would let them pull.
+        # Version 2 stops readers that would let springs pull that only push.
         "version": 2 if twin.topology.pushes.any() else body.version(twin),
         "made_by": f"neuspring {__version__}",
         "name": source.name,
@@ -98,7 +98,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-    """Arrays, and what is said of each: dimensions, shape, dtype, unit, meaning."""
+    """The arrays, and the description of each: dimensions, shape, dtype, unit, meaning."""
     arrays = {}
     described = {}
 
@@ -112,7 +112,7 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
             value = getattr(values, spec.name)
             if "shape" in spec.metadata and value.size and prefix + spec.name not in MOTION:
                 meta = spec.metadata
-                # Splats declare their count as N, which is the nodes' here.
+                # Splats declare their count as N, but here N counts nodes.
                 sizes = ["G" if prefix == "splat_" and size == "N" else size for size in meta["shape"]]
                 add(prefix + spec.name, ",".join(sizes), meta["unit"], meta["doc"], value)
 
@@ -124,11 +124,11 @@ def arrays_of(source: ExportSource, frames: Sequence[int]) -> tuple[dict[str, np
     moving = {"frame": part.frames, "time": part.times, "mass": source.masses}
     for name, (dimensions, unit, about) in MOTION.items():
         if name == "mass" and not source.masses.any():
-            continue  # other points of the body have the mass
+            continue  # Other points of the body have the mass.
         add(name, dimensions, unit, about, moving[name] if name in moving else getattr(part, name))
     if source.splats is not None:
         declared(source.splats, "splat_")
     return arrays, described
 
 
-export = Export(write=write, name="{name}_npz")
+export = Export(write=write, name="{name}_npz", then="Next: read {output}/description.json")

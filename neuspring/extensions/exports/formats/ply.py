@@ -1,4 +1,4 @@
-"""PLY: the spring graph as vertices and edges, and splats in the layout of splat viewers, a file of each per frame."""
+"""PLY: the spring graph as vertices and edges, and splats in the layout of splat viewers; one file of each per frame."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMMENT = "units m, N, N s/m, kg; stiffness of a vertex: mean of its springs"
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
-    """Write springs_<frame>.ply and, where there are splats, splats_<frame>.ply to the folder `output`."""
+    """Write springs_<frame>.ply and, if the source has splats, splats_<frame>.ply to the folder `output`."""
     made = []
     for frame in frames:
         made.append(output / f"springs_{frame:05d}.ply")
@@ -35,7 +35,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
 
 
 def unit_quaternions(splats: Splats) -> np.ndarray:
-    """Orientations of norm 1 [N, 4], w first: not every reader brings them there."""
+    """Normalized orientations [N, 4], w first, because not every reader normalizes them."""
     return np.asarray(splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True))
 
 
@@ -45,7 +45,7 @@ def points(source: ExportSource, frame: int) -> np.ndarray:
 
 
 def vertices(source: ExportSource, frame: int) -> np.ndarray:
-    """A row per point, as in `Lines`; a controller has no mass and region -1. Stiffness is 0 where there are no springs."""
+    """One row per point, in the order of `Lines`. Controllers have region -1 and no mass. Without springs the stiffness is 0."""
     nodes, placed, lines = len(source.positions[frame]), points(source, frame), lines_of(source.twin)
     moved = nodes + len(source.hands[frame])
     table = np.zeros(len(placed), VERTEX)
@@ -61,7 +61,7 @@ def vertices(source: ExportSource, frame: int) -> np.ndarray:
 
 
 def edges(source: ExportSource, frame: int) -> np.ndarray:
-    """A row per spring; of a rod, per edge of the line, whose stiffness is EI / l^2, and then per spring."""
+    """One row per spring. For a rod, first one row per edge of its center line, with the stiffness EI / l^2."""
     lines, dashpot = lines_of(source.twin), source.twin.material.dashpot
     table = np.zeros(len(lines.pairs), EDGE_DTYPE)
     table["vertex1"], table["vertex2"] = lines.pairs.T
@@ -82,4 +82,4 @@ def _write_elements(path: Path, elements: dict[str, np.ndarray]) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
-export = Export(write=write, frames="0")
+export = Export(write=write, frames="0", then="Next: open the files in {output}, for example in MeshLab")

@@ -1,7 +1,7 @@
-"""Rerun: what was filmed and observed, what is predicted, and the errors of each frame, on one timeline.
+"""Rerun: video, observations, prediction and the errors of each frame, on one timeline.
 
-Nothing is shown and no server is asked: the file is written, and `rerun FILE` opens it. Colors and radii are stored once, places by
-time. Splats are left out, because Rerun's form of them is not stable yet.
+The export only writes a file, which `rerun FILE` opens. Colors and radii are stored once, positions per frame. Splats are omitted
+because Rerun's format for them is not stable.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LOOKS = {
     "recorded/points": ((0, 150, 90), 1.5),
     "recorded/tracks": ((150, 0, 200), 4.0),
 }
-"""Color and radius, in points of the screen."""
+"""Color, and radius in screen points."""
 SPRING_RADIUS = 0.5
 RRD_JPEG_QUALITY = 90
 
@@ -43,13 +43,13 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     folder, seen = source.scenario_folder, source.seen
     capture = capture_of(folder, seen, notes) if folder is not None and seen is not None else None
     for note in notes:
-        print(f"The film is left out: {note}")
+        print(f"The video is omitted: {note}")
     write_atomically(output, lambda path: _Recording(source.only(frames), path).write(source, capture))
     return [output]
 
 
 class _Recording:
-    """A file that is being written; F exported frames."""
+    """Writes one file with F exported frames."""
 
     def __init__(self, part: ExportSource, path: Path) -> None:
         self._part, self._rr = part, needed("rerun")
@@ -57,8 +57,8 @@ class _Recording:
         self._stream.save(path)
 
     def write(self, source: ExportSource, capture: Capture | None) -> None:
-        """Write everything; `source` has all frames, of which errors are computed."""
-        # Elsewhere Rerun logs a fault and leaves the data out.
+        """Write all entities; `source` has all frames, because errors depend on all of them."""
+        # Without this context Rerun logs errors and omits the data.
         with self._rr.error_utils.catch_and_log_exceptions("export", strict=True):
             self._stream.send_recording_name(source.name)
             self._still("about", self._rr.TextDocument(f"{source.name}: {source.weight}"))
@@ -74,14 +74,14 @@ class _Recording:
         rr, part, lines = self._rr, self._part, lines_of(self._part.twin)
         clouds = {"predicted/nodes": list(part.positions), "hands": list(part.hands)}
         if (seen := part.seen) is not None:
-            places, visible = seen.object_points[part.frames], seen.object_visibility[part.frames]
-            clouds["recorded/points"] = [row[shown] for row, shown in zip(places, visible, strict=True)]
+            points, visible = seen.object_points[part.frames], seen.object_visibility[part.frames]
+            clouds["recorded/points"] = [row[shown] for row, shown in zip(points, visible, strict=True)]
             clouds["recorded/tracks"] = [row[np.isfinite(row).all(axis=1)] for row in seen.tracks[part.frames]]
-        for name, found in clouds.items():
+        for name, cloud_per_frame in clouds.items():
             color, radius = LOOKS[name]
             self._still(f"world/{name}", rr.Points3D.from_fields(colors=[color], radii=rr.Radius.ui_points(radius)))
-            points = rr.Points3D.columns(positions=np.concatenate(found).astype(np.float32))
-            self._over_time(f"world/{name}", points.partition([len(cloud) for cloud in found]))
+            columns = rr.Points3D.columns(positions=np.concatenate(cloud_per_frame).astype(np.float32))
+            self._over_time(f"world/{name}", columns.partition([len(cloud) for cloud in cloud_per_frame]))
         ends = [lines.points(nodes, hands)[lines.pairs] for nodes, hands in zip(part.positions, part.hands, strict=True)]
         look = {"colors": colors(lines.stiffness), "radii": rr.Radius.ui_points(SPRING_RADIUS)}
         self._still("world/predicted/springs", rr.LineStrips3D.from_fields(**look))
@@ -89,7 +89,7 @@ class _Recording:
         self._over_time("world/predicted/springs", strips.partition([len(lines.pairs)] * len(ends)))
 
     def _errors(self, source: ExportSource) -> None:
-        """A curve per metric of positions or marked points, without frames that have no value."""
+        """One curve per metric of positions or annotated points, without frames that have no value."""
         if (seen := source.seen) is None:
             return
         errors = errors_per_frame(source.positions, seen) | errors_per_frame(source.positions, seen, "marks")
@@ -102,20 +102,20 @@ class _Recording:
     def _film(self, capture: Capture) -> None:
         rr, unit = self._rr, capture.description.depth_unit
         for name, camera in capture.cameras.items():
-            place, pose = f"world/cameras/{name}", camera.camera_to_world
+            path, pose = f"world/cameras/{name}", camera.camera_to_world
             size = [camera.width, camera.height]
-            self._still(place, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-            self._still(place, rr.Pinhole(image_from_camera=camera.intrinsics, resolution=size, camera_xyz=rr.ViewCoordinates.RDF))
+            self._still(path, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            self._still(path, rr.Pinhole(image_from_camera=camera.intrinsics, resolution=size, camera_xyz=rr.ViewCoordinates.RDF))
             for frame, time in zip(self._part.frames.tolist(), self._part.times.tolist(), strict=True):
                 self._stream.set_time("frame", sequence=frame)
                 self._stream.set_time("time", duration=time)
                 if not capture.has(name, frame):
-                    self._stream.log(place, rr.Clear(recursive=True))
+                    self._stream.log(path, rr.Clear(recursive=True))
                     continue
-                self._stream.log(f"{place}/color", rr.Image(capture.color(name, frame)).compress(RRD_JPEG_QUALITY))
+                self._stream.log(f"{path}/color", rr.Image(capture.color(name, frame)).compress(RRD_JPEG_QUALITY))
                 if "depth" in capture.streams:
                     counts = np.rint(capture.depth(name, frame) / unit).astype(np.uint16)
-                    self._stream.log(f"{place}/depth", rr.DepthImage(counts, meter=1 / unit))
+                    self._stream.log(f"{path}/depth", rr.DepthImage(counts, meter=1 / unit))
 
     def _over_time(self, entity: str, columns: Any, known: Any = slice(None)) -> None:
         part, rr = self._part, self._rr
@@ -126,4 +126,4 @@ class _Recording:
         self._stream.log(entity, what, static=True)
 
 
-export = Export(write=write, name="{name}.rrd")
+export = Export(write=write, name="{name}.rrd", then="Next: .venv/bin/rerun {output}")

@@ -1,4 +1,4 @@
-"""USD: animated nodes, springs as curves, and splats as Gaussian particle fields with points as their stand-in."""
+"""USD: animated nodes, springs as curves, and splats as Gaussian particle fields with points as proxy."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from neuspring.twin.body import lines_of
 SUFFIXES = (".usdc", ".usda", ".usd")
 ROOT_PRIM = "/Twin"
 SPRING_WIDTH, NODE_WIDTH = 0.1, 0.3
-"""Width of springs and of nodes, in median rest lengths."""
+"""Widths of springs and nodes, in median rest lengths."""
 SPLAT_REACH = float(np.sqrt(2 * np.log(255)))
-"""Standard deviations from the center to where 1 / 255 is left of an opaque splat, which is as far as it is drawn."""
+"""Radius of a rendered splat, in standard deviations: an opaque splat has the coverage 1 / 255 there."""
 
 
 def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Path]:
-    """Write one file, with a time code per frame of the twin."""
+    """Write one file, with one time code per frame of the twin."""
     Usd, UsdGeom = needed("pxr.Usd"), needed("pxr.UsdGeom")
     if output.suffix not in SUFFIXES:
         raise InputError("--output", f"must end with {', '.join(SUFFIXES)}", output.name)
     rate = 1 / source.twin.simulation.frame_time
     codes = {frame: round(float(source.times[frame]) * rate, 6) for frame in frames}
-    stage = Usd.Stage.CreateInMemory(f"twin{output.suffix}")  # The suffix chooses the encoding.
+    stage = Usd.Stage.CreateInMemory(f"twin{output.suffix}")  # The suffix selects the encoding.
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rate)
@@ -43,7 +43,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
     root = UsdGeom.Xform.Define(stage, ROOT_PRIM)
     stage.SetDefaultPrim(root.GetPrim())
     if source.twin.simulation.up == "-z":
-        root.AddRotateXOp().Set(180.0)  # USD has no axis that points down.
+        root.AddRotateXOp().Set(180.0)  # USD has no up axis that points down.
     shapes = _Shapes(stage)
     shapes.graph(source, codes)
     if source.splats is not None:
@@ -53,7 +53,7 @@ def write(source: ExportSource, frames: Sequence[int], output: Path) -> list[Pat
 
 
 def colors(stiffness: np.ndarray) -> np.ndarray:
-    """RGB [S, 3]: blue where a spring is soft, red where it is stiff, by the logarithm of its stiffness."""
+    """RGB [S, 3] by the logarithm of stiffness: soft springs are blue, stiff springs red."""
     logs = np.log(np.maximum(stiffness, 1e-9))
     span = np.ptp(logs) if len(logs) else 0.0
     share = (logs - logs.min()) / span if span else np.full(len(logs), 0.5)
@@ -61,14 +61,14 @@ def colors(stiffness: np.ndarray) -> np.ndarray:
 
 
 class _Shapes:
-    """Prims of a stage."""
+    """Adds prims to a stage."""
 
     def __init__(self, stage: Any) -> None:
         self._stage = stage
         self._geom, self._vt, self._sdf = (needed(f"pxr.{name}") for name in ("UsdGeom", "Vt", "Sdf"))
 
     def graph(self, source: ExportSource, codes: dict[int, float]) -> None:
-        """Nodes, controllers and springs; of another body also its lines."""
+        """Add nodes, controllers and springs, and the lines of a body other than the lattice."""
         topology, material, token = source.twin.topology, source.twin.material, self._geom.Tokens
         unit = float(np.median(topology.rest_lengths)) if len(topology.rest_lengths) else 0.01
         nodes = self._points("Nodes", NODE_WIDTH * unit, (0.8, 0.8, 0.8))
@@ -91,10 +91,10 @@ class _Shapes:
             if body:
                 shown[body] = both[inner].reshape(-1, 3)
             for prim, points in shown.items():
-                self._place(prim, prim.CreatePointsAttr(), points, prim.GetWidthsAttr().Get()[0] / 2, code)
+                self._sample_points(prim, prim.CreatePointsAttr(), points, prim.GetWidthsAttr().Get()[0] / 2, code)
 
     def splats(self, source: ExportSource, codes: dict[int, float]) -> None:
-        """Splats for renderers that know Gaussians, and points (purpose proxy) for those that do not."""
+        """Add splats for renderers that support Gaussians, and points (purpose proxy) for other renderers."""
         token = self._geom.Tokens
         field = needed("pxr.UsdVol").ParticleField3DGaussianSplat.Define(self._stage, f"{ROOT_PRIM}/Splats")
         stand_in = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/SplatPoints")
@@ -116,13 +116,13 @@ class _Shapes:
                 stand_in.CreateWidthsAttr(self._vt.FloatArray.FromNumpy((2 * scales.mean(axis=1)).astype(np.float32)))
                 self._primvar(stand_in, "displayColor", np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1), token.vertex)
                 self._primvar(stand_in, "displayOpacity", opacities, token.vertex)
-            if splats.harmonics[:, 1:].any():  # They turn with the splats.
+            if splats.harmonics[:, 1:].any():  # They rotate with the splats.
                 self._sample(coefficients, shades, code)
             # pxr keeps the real part last.
             self._sample(field.CreateOrientationsAttr(), self._vt.QuatfArray.FromNumpy(np.roll(turns, -1, axis=1)), code)
             axes = Rotation.from_quat(turns, scalar_first=True).as_matrix() * scales[:, None]
-            self._place(field, field.CreatePositionsAttr(), means, SPLAT_REACH * np.linalg.norm(axes, axis=2), code)
-            self._place(stand_in, stand_in.CreatePointsAttr(), means, scales.mean(axis=1, keepdims=True), code)
+            self._sample_points(field, field.CreatePositionsAttr(), means, SPLAT_REACH * np.linalg.norm(axes, axis=2), code)
+            self._sample_points(stand_in, stand_in.CreatePointsAttr(), means, scales.mean(axis=1, keepdims=True), code)
 
     def _points(self, name: str, width: float, color: tuple[float, float, float]) -> Any:
         prim = self._geom.Points.Define(self._stage, f"{ROOT_PRIM}/{name}")
@@ -139,15 +139,15 @@ class _Shapes:
         prim.SetWidthsInterpolation(self._geom.Tokens.constant)
         return prim
 
-    def _place(self, prim: Any, attribute: Any, points: np.ndarray, reach: np.ndarray | float, code: float) -> None:
-        """Points with their extent, `reach` beyond each: no plugin of USD computes that of splats and of points of one width."""
+    def _sample_points(self, prim: Any, attribute: Any, points: np.ndarray, reach: np.ndarray | float, code: float) -> None:
+        """Set points and their extent, with the margin `reach`; USD computes no extent for splats and for points of one width."""
         self._sample(attribute, self._vectors(points), code)
         if len(points):
             corners = np.stack([(points - reach).min(axis=0), (points + reach).max(axis=0)])
             self._sample(self._geom.Boundable(prim.GetPrim()).CreateExtentAttr(), self._vectors(corners), code)
 
     def _sample(self, attribute: Any, value: Any, code: float) -> None:
-        """The value at a time; the first is the default value too, since importers without a time (Newton's) read nothing else."""
+        """Set the value at a time code. The first value is also the default, the only one that Newton's importer reads."""
         if not attribute.HasAuthoredValue():
             attribute.Set(value)
         attribute.Set(value, code)
@@ -156,10 +156,10 @@ class _Shapes:
         return self._vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
     def _primvar(self, prim: Any, name: str, values: np.ndarray, interpolation: str) -> None:
-        """Colors [n, 3], or numbers [n]."""
+        """Add a primvar of colors [n, 3] or of numbers [n]."""
         kind = self._sdf.ValueTypeNames.Find("float[]" if values.ndim == 1 else "color3f[]")
         stored = self._vt.FloatArray.FromNumpy(values.astype(np.float32)) if values.ndim == 1 else self._vectors(values)
         self._geom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation).Set(stored)
 
 
-export = Export(write=write, name="{name}.usdc")
+export = Export(write=write, name="{name}.usdc", then="Next: import {output} in Blender, or open it in usdview")
