@@ -96,12 +96,12 @@ def test_what_is_shown_is_in_the_cell_and_in_the_file(folder, tmp_path):
         alone = film.size
     with Image.open(io.BytesIO(ns.show(short, run.observations, film=True).data)) as film:
         assert film.format == "GIF" and film.size[0] > 1.5 * alone[0], "observed beside predicted"
-    with pytest.raises(InputError, match=r"twin\.gif: a film is of a trajectory; received a twin"):
+    with pytest.raises(InputError, match=r"twin\.gif: a video needs a trajectory; received a twin"):
         ns.show(run.twin, output=tmp_path / "twin.gif")
     with pytest.raises(InputError, match=r"run\.doc: must end in one of \.png"):
         ns.show(run, output="run.doc")
     longer = ns.Trajectory(positions=np.repeat(run.trajectory.positions, 2, axis=0), frame_count=2 * len(run.trajectory.positions))
-    with pytest.raises(InputError, match="Show a trajectory under other hands without them"):
+    with pytest.raises(InputError, match="Leave them out for other controllers"):
         ns.show(longer, run.observations, film=True)
 
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PLACES = ("", ".github", "config", "findings", "results", "results/published/bench", "tests/golden", "workflow")
 PAGES = [*(path for place in PLACES for path in sorted((ROOT / place).glob("*.md"))), *sorted((ROOT / "neuspring").rglob("*.md"))]
 WRITTEN = [page for page in PAGES if page != ROOT / "config" / "README.md"]
-MOST_WORDS, ALL_WORDS = 2_900, 31_000
+MOST_WORDS, ALL_WORDS = 2_200, 30_000
 """Of a hand-written page, and of all of them."""
 NUMBERS = re.compile(r"<!-- numbers: (.+?) -->\n+(?:\|.*\n){2}((?:\|.*\n)+)")
 """Files of the numbers of a table, and its lines below the head."""

@@ -1,7 +1,7 @@
-"""Checks of data, before any cost. `table` lists all of them with their limits; the other files measure.
+"""Checks of data and of perception's results. `table` lists all checks with their limits; the other modules measure.
 
-To add a check: a function that measures, and an entry of `table.checks`. A package adds `Check`s of one of our kinds of subject
-by an entry point of the group `neuspring.checks`.
+To add a check, write a function that measures, and add an entry to `table.checks`. A package adds a `Check`, or several, of the
+existing kinds of subject by an entry point of the group `neuspring.checks`.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from neuspring.core.findings import Finding
 from neuspring.registry import Registry
 
 CHECKS: Registry[Check | tuple[Check, ...]] = Registry("checks", {"core": "neuspring.checks.table:checks"}, (Check, tuple))
-"""The table of the core, and the checks of packages."""
+"""The checks of the core and of packages."""
 
 
 def examine(of: str, where: object, *subject: Any, streams: frozenset[str] | None = None) -> list[Finding]:
-    """All findings about a `subject` of the kind `of`, found at the file, camera or other place `where`.
+    """All findings about a `subject` of the kind `of`; `where` is its file, camera or other location.
 
-    `streams`: those of the capture, where checks that need others are left out.
+    `streams` are the streams of the capture: checks that need another stream are skipped. None: no check is skipped.
     """
-    listed = [one for member in CHECKS.values() for one in ((member,) if isinstance(member, Check) else member)]
+    listed = [check for member in CHECKS.values() for check in ((member,) if isinstance(member, Check) else member)]
     fitting = [check for check in listed if check.of == of and (streams is None or streams.issuperset(check.needs))]
-    return [found for check in fitting for found in check.findings(where, *subject)]
+    return [finding for check in fitting for finding in check.findings(where, *subject)]

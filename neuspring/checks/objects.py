@@ -1,4 +1,4 @@
-"""Object and hands of one camera, by masks and depth: size, height above the table, and whether they meet."""
+"""Object and hands of one camera, from masks and depth: size, height above the table, and contact."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from neuspring.data.camera import Camera
 from neuspring.data.capture import HANDS, OBJECT
 
 SAMPLED = 5
-"""Frames per camera, evenly spaced, that are compared with the world."""
+"""Number of evenly spaced frames per camera that are lifted to 3D."""
 WITHIN = (0.01, 0.99)
-"""Quantiles between which an object lies: beyond them are pixels of its outline whose depth is between it and the background."""
+"""Quantiles that bound an object; pixels of its outline with depths between object and background are outside of them."""
 APART, SPARSE, PIECE = 0.2, 4.0, 0.02
-"""Gaps of this fraction of an object's size, and of so many distances between its points, part it into pieces; pieces with a
-smaller share of its points are no part of it. Where hands or a fold hide a part, the others are larger."""
+"""A gap separates pieces if it exceeds APART of the object's size and SPARSE times the distance of its points. Pieces with less
+than PIECE of the points do not count; pieces that occlusion by hands or folds separates are larger."""
 HAND_REACH = 0.06
-"""m. A hand that never comes nearer to the object does not hold it. Where they touch, depth may be hidden."""
+"""Distance, m, within which a hand may hold the object. It is not zero, because contacts are often occluded."""
 HAND_RATIO = 12.0
-"""Hands so many times as large as the object in the image are something else."""
+"""Largest plausible ratio of hand pixels to object pixels."""
 PLAUSIBLE = (0.02, 1.2)
-"""Longest side of an object, m."""
+"""Plausible range of an object's longest side, m."""
 COMPARED_POINTS, FEWEST_POINTS = 1500, 20
-"""Points of object and hands that are compared, and points below which nothing is reported."""
+"""Largest number of compared points, and smallest number that is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class Sample:
     """One frame of one camera."""
 
     depth: np.ndarray
-    """[H, W], m, 0: none."""
+    """[H, W], m; 0: no measurement."""
     mask: np.ndarray
     """[H, W] labels."""
     color: np.ndarray | None = None
-    """[H, W, 3] uint8 RGB, where it was read too."""
+    """[H, W, 3] uint8 RGB; None if it was not read."""
 
 
 Samples = Mapping[int, Sample]
@@ -52,12 +52,12 @@ Samples = Mapping[int, Sample]
 
 
 def sampled(frames: int) -> set[int]:
-    """Numbers of the frames that are compared with the world."""
+    """Indices of the SAMPLED frames."""
     return set(np.linspace(0, frames - 1, SAMPLED).astype(int).tolist())
 
 
 def of_body(points: np.ndarray) -> np.ndarray:
-    """True for points [n, 3], m, of an object [n]; False for strays, pieces that are small and apart: see `APART`."""
+    """[n] bool: True for points [n, 3], m, of the object, False for small separate pieces (`APART`)."""
     if not len(points):
         return np.zeros(0, bool)
     low, high = np.quantile(points, (0.05, 0.95), axis=0)
@@ -73,12 +73,12 @@ def of_body(points: np.ndarray) -> np.ndarray:
 
 
 def extents(points: np.ndarray) -> np.ndarray:
-    """Lowest and highest coordinates [2, 3] of an object by its points [n, 3], m, without strays."""
+    """Lowest and highest coordinates [2, 3] of an object's points [n, 3], m, without small separate pieces."""
     return np.asarray(np.quantile(points[of_body(points)], WITHIN, axis=0))
 
 
 def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
-    """World points [n, 3], m, of the pixels with a label and depth; at most COMPARED_POINTS, and no strays of the object."""
+    """World points [n, 3], m, of pixels with this label and depth, at most COMPARED_POINTS; of the object without strays."""
     y, x = np.nonzero((sample.mask == label) & (sample.depth > 0))
     step = -(-len(x) // COMPARED_POINTS) or 1
     y, x = y[::step], x[::step]
@@ -87,13 +87,13 @@ def lifted(camera: Camera, sample: Sample, label: int) -> np.ndarray:
 
 
 def holes(camera: Camera, samples: Samples) -> float | None:
-    """Mean share of the object's pixels without depth."""
+    """Mean fraction of object pixels without depth."""
     missing = [float((s.depth[s.mask == OBJECT] <= 0).mean()) for s in samples.values() if (s.mask == OBJECT).any()]
     return float(np.mean(missing)) if missing else None
 
 
 def hand_area(camera: Camera, samples: Samples) -> dict[str, Any] | None:
-    """Median area of the hands, m²; infinite where they are HAND_RATIO times as large as the object in the image."""
+    """Median area of the hands, m²; infinite if they have more than HAND_RATIO times the object's pixels."""
     areas, ratios = [], []
     for sample in samples.values():
         own = sample.mask == HANDS
@@ -110,7 +110,7 @@ def hand_area(camera: Camera, samples: Samples) -> dict[str, Any] | None:
 
 
 def hand_gap(camera: Camera, samples: Samples) -> float | None:
-    """Least distance of hands from the object, m, over the frames in which both are in view."""
+    """Smallest distance between hands and object, m, over the frames that show both."""
     gaps = []
     for sample in samples.values():
         body, hands = (lifted(camera, sample, label) for label in (OBJECT, HANDS))
@@ -120,21 +120,21 @@ def hand_gap(camera: Camera, samples: Samples) -> float | None:
 
 
 Place = Mapping[int, np.ndarray]
-"""Lowest and highest coordinates of the object [2, 3], m, by frame; the third are heights above the table."""
+"""Frame -> lowest and highest coordinates of the object [2, 3], m; the third coordinate is the height above the table."""
 
 
 def place_of(bodies: Mapping[int, np.ndarray], up: float) -> Place:
-    """Place of the object by its points [n, 3], m, in the world, by frame; `up` is +1 or -1. Too few points are left out."""
+    """Extent of the object by frame, from its world points [n, 3], m; `up` is +1 or -1. Frames with few points are skipped."""
     return {frame: extents(points * (1, 1, up)) for frame, points in bodies.items() if len(points) >= FEWEST_POINTS}
 
 
 def in_cm(sides: Iterable[float]) -> str:
-    """Sides, m, as `12 x 9`, cm; those of less than 1 cm with a digit more."""
+    """Sides, m, as text in cm, for example `12 x 9`; sides below 1 cm get one decimal."""
     return " x ".join(f"{100 * side:.{0 if side >= 0.01 else 1}f}" for side in sides)
 
 
 def size(place: Place) -> dict[str, Any] | None:
-    """Sides of the object and its heights above the table, in the first frame that shows it; a warning beyond PLAUSIBLE."""
+    """Sides and heights of the object in the first frame that shows it; a warning if the longest side is not PLAUSIBLE."""
     longest = np.median(np.ptp([*place.values()], axis=1), axis=0).max() if place else 0.0
     level = "note" if PLAUSIBLE[0] <= longest <= PLAUSIBLE[1] else "warning"
     for frame, (low, high) in place.items():
@@ -152,7 +152,7 @@ def lowest(place: Place) -> dict[str, Any] | None:
 
 
 def hands_on(camera: Camera, sample: Sample) -> int:
-    """The number of hands within HAND_REACH of the object in a frame; pieces within 4 % of the image are one hand."""
+    """Number of hands within HAND_REACH of the object in a frame; pieces closer than 4 % of the image width are one hand."""
     body, own = lifted(camera, sample, OBJECT), sample.mask == HANDS
     reach = max(int(0.02 * camera.width), 1)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
@@ -160,19 +160,19 @@ def hands_on(camera: Camera, sample: Sample) -> int:
     if len(body) < FEWEST_POINTS:
         return 0
     tree = KDTree(body)
-    each = [lifted(camera, Sample(sample.depth, np.where(own & (pieces == k), HANDS, 0)), HANDS) for k in range(1, count)]
-    return sum((tree.query(hand)[0] <= HAND_REACH).sum() >= FEWEST_POINTS for hand in each)
+    hands = [lifted(camera, Sample(sample.depth, np.where(own & (pieces == k), HANDS, 0)), HANDS) for k in range(1, count)]
+    return sum((tree.query(hand)[0] <= HAND_REACH).sum() >= FEWEST_POINTS for hand in hands)
 
 
 def constant_grips(counts: np.ndarray, rate: float, folder: Path) -> dict[str, Any] | None:
-    """The times with a constant number of hands at the object [T], by all cameras of a capture, and the longest of them."""
+    """Spans of frames with a constant number of hands at the object, `counts` [T] over all cameras, and the longest of them."""
     steady = median_filter(counts, 5, mode="nearest")
     edges = [0, *(np.flatnonzero(np.diff(steady)) + 1).tolist(), len(steady)]
     spans = [(first, end - 1, int(steady[first])) for first, end in pairwise(edges)]
     if len(spans) < 2:
         return None
-    held = [span for span in spans if span[2] and span[1] - span[0] + 1 >= rate]
-    ranked = sorted(held, key=lambda span: span[0] - span[1])[:3]
+    grasps = [span for span in spans if span[2] and span[1] - span[0] + 1 >= rate]
+    ranked = sorted(grasps, key=lambda span: span[0] - span[1])[:3]
     commands = " or ".join(f"--frames {first}-{last}" for first, last, _ in ranked)
-    cut = f": neuspring cut-capture {folder} {commands} --output ..." if ranked else "; none lasts 1 s"
+    cut = f": neuspring cut-capture {folder} {commands} --output ..." if ranked else ", but none lasts 1 s"
     return {"text": ", ".join(f"{first}-{last}: {count}" for first, last, count in spans), "cut": cut}

@@ -1,4 +1,4 @@
-"""Observations that every method reads: nodes, motion of the object, and controllers."""
+"""Observations: nodes, motion of the object, and controllers."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from neuspring.core.artifacts import Observations
 from neuspring.core.geometry import lean
 
 FIRST, SETTLED = 4, 0.005
-"""Frames in which an object at rest moves less than so many m."""
+"""An object is at rest if it moves less than SETTLED, m, in the FIRST frames."""
 GRIP = 0.04
-"""m from the object within which a controller can hold it."""
+"""Distance from the object, m, within which a controller can hold it."""
 NO_INTERACTION = 0.15
-"""m between hand and object, at their nearest, from which there is no interaction to learn from."""
+"""Smallest distance between controllers and object, m, above which there is no interaction."""
 OF_CONTROLLERS: dict[str, Any] = {"where": "controllers"}
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Observations, and the share of training frames in which the image of the object changes, as masks show it."""
+    """Observations, and `moves`: the fraction of training frames in which the object's image changes."""
 
     observations: Observations
     moves: float = 0.0
 
     @property
     def motion(self) -> tuple[float, float]:
-        """Farthest motion of the object in a training frame, m, which a tenth of its points exceed; largest share that is lost.
+        """Largest displacement of the object in training frames, m, and the largest fraction of invisible points.
 
-        It is not known where frame 0 alone shows the object: inf.
+        The displacement of a frame is the 90th percentile over visible points; inf if only frame 0 shows the object.
         """
-        end, image, seen_of = self.observations.scenario.train_end, self.observations.image, self.observations
+        end, image, space = self.observations.scenario.train_end, self.observations.image, self.observations
         if image is None:
-            seen, points = seen_of.object_visibility[:end], seen_of.object_points
+            seen, points = space.object_visibility[:end], space.object_points
             moved = np.linalg.norm(points[:end] - points[0], axis=2)
         else:
             seen, moved = image.visible[:end], image.pixel_size * np.linalg.norm(image.pixels[:end] - image.pixels[0], axis=2)
@@ -45,7 +45,7 @@ class Observed:
 
     @cached_property
     def apart(self) -> np.ndarray:
-        """[T, C], m: controllers from the nearest point of the object that is seen; in frame 0 from all nodes."""
+        """[T, C], m: distance of controllers from the nearest visible point of the object, in frame 0 from the nearest node."""
         seen = self.observations
         apart = np.full(seen.controller_points.shape[:2], np.inf)
         for frame, own in enumerate(seen.controller_points):
@@ -56,28 +56,28 @@ class Observed:
 
     @property
     def meets(self) -> bool:
-        """True where hands come near the object: only then is more reported of them."""
+        """True if hands come near the object. Otherwise only `gap` is reported."""
         return bool(self.apart.min() <= NO_INTERACTION)
 
 
 def gap(seen: Observed) -> dict[str, Any]:
-    """Least distance of a controller from the object, m."""
+    """Smallest distance between controllers and object, m."""
     return OF_CONTROLLERS | {"value": float(seen.apart.min())}
 
 
 def first_gap(seen: Observed) -> dict[str, Any] | None:
-    """Least distance of a controller from the object in frame 0, m."""
+    """Smallest distance between controllers and object in frame 0, m."""
     return OF_CONTROLLERS | {"value": float(seen.apart[0].min())} if seen.meets else None
 
 
 def motion_of_hands(seen: Observed) -> dict[str, Any] | None:
-    """The farthest motion of controllers, m."""
+    """Largest displacement of a controller from frame 0, m."""
     points = seen.observations.controller_points
     return OF_CONTROLLERS | {"value": float(np.linalg.norm(points - points[0], axis=2).max())} if seen.meets else None
 
 
 def speed_of_hands(seen: Observed) -> dict[str, Any] | None:
-    """The largest median speed of controllers between two frames, m/s."""
+    """Largest median speed of the controllers between two frames, m/s."""
     rate = seen.observations.scenario.frame_rate
     speed = rate * np.median(np.linalg.norm(np.diff(seen.observations.controller_points, axis=0), axis=2), axis=1)
     if not seen.meets or not len(speed):
@@ -87,7 +87,7 @@ def speed_of_hands(seen: Observed) -> dict[str, Any] | None:
 
 
 def leaning(seen: Observed) -> dict[str, Any] | None:
-    """Angle, degrees, at which the object hangs at rest beside the vertical through its hands in frame 0."""
+    """Angle, degrees, in frame 0 between the vertical and an object that hangs at rest; None if it does not hang freely."""
     own = seen.observations
     up, hands, points = (
         own.scenario.up_sign,
@@ -102,13 +102,13 @@ def leaning(seen: Observed) -> dict[str, Any] | None:
 
 
 def motion_of_object(seen: Observed) -> dict[str, Any]:
-    """Farthest motion of the object in the training frames, m."""
+    """Largest displacement of the object in training frames, m."""
     moved, lost = seen.motion
-    detail = f"its image changes in {seen.moves:.0%} of the training frames, up to {lost:.0%} of its points are lost"
+    detail = f"its image changes in {seen.moves:.0%} of the training frames; up to {lost:.0%} of its points are invisible"
     return {"value": moved, "detail": detail}
 
 
 def node_count(seen: Observed) -> dict[str, Any]:
-    """Structure points."""
+    """Number of nodes."""
     count = len(seen.observations.nodes)
     return {"value": count, "level": "error" if count < 4 else "note" if count > 30 else "warning"}

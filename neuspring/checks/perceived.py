@@ -1,4 +1,4 @@
-"""Checks by the steps of perception of their own results: masks, tracks, lifted points, the shape and the observations."""
+"""Checks that the perception stages apply to their own results: masks, tracks, lifted points, shape and observations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neuspring.data.results import LiftedTracks, ShapePrior
 
 
 def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapping[str, float]) -> list[Finding]:
-    """Findings about labels [T, H, W] of one camera, with their `mask_facts`."""
+    """Findings about labels [T, H, W] of one camera; `facts` are their `mask_facts`."""
     where, streams = f"camera {camera}", capture.streams
     frames = [frame for frame in sorted(sampled(capture.frame_count)) if capture.has(camera, frame)]
     samples = {frame: Sample(capture.depth(camera, frame), labels[frame]) for frame in frames}
@@ -29,25 +29,28 @@ def look_at_masks(capture: Capture, camera: str, labels: np.ndarray, facts: Mapp
 
 
 def look_at_tracks(capture: Capture, camera: str, labels: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> list[Finding]:
-    """Findings about tracks: pixels [T, Q, 2] and visible [T, Q], with the masks' labels [T, H, W]."""
+    """Findings about the object's tracks, selected by the labels of frame 0.
+
+    labels [T, H, W]; pixels [T, Q, 2], x and y; visible [T, Q] bool.
+    """
     x, y = np.round(pixels[0]).astype(int).T
     return examine("visible points", f"camera {camera}", visible[:, labels[0][y, x] == OBJECT])
 
 
 def look_at_observations(observations: Observations, moves: float = 0.0) -> list[Finding]:
-    """Findings about what every method reads; `moves` as in `Observed`."""
+    """Findings about the observations; `moves` as in `Observed`."""
     return examine("observations", "observations", Observed(observations, moves))
 
 
 def look_at_lifted(lifted: LiftedTracks, prior: ShapePrior, up: float) -> list[Finding]:
-    """Findings about points in the world and the shape; `up` is +1 or -1."""
+    """Findings about lifted tracks and the shape prior; `up` is +1 or -1."""
     found = examine("object", "object of all cameras", place_of({0: lifted.cloud}, up))
     found += examine("visible points", "lifted tracks", lifted.object_visibility)
     return found + examine("lifted tracks", "lifted tracks", lifted)
 
 
 def followed(visible: np.ndarray) -> dict[str, Any] | None:
-    """The least share of points [T, n] that are visible in a frame."""
+    """The smallest fraction of points, visible [T, n], that are visible in a frame."""
     if not visible.shape[1]:
         return None
     alive = visible.mean(axis=1)
@@ -55,12 +58,12 @@ def followed(visible: np.ndarray) -> dict[str, Any] | None:
 
 
 def trusted(lifted: LiftedTracks) -> float | None:
-    """Share of the object's motions that agree with their neighbors, of points that are seen in both frames."""
+    """Fraction of motions of object points, visible in both frames, that agree with their neighbors."""
     both = lifted.object_visibility[:-1] & lifted.object_visibility[1:]
     return float(lifted.object_motion_valid[:-1].sum() / max(int(both.sum()), 1)) if both.any() else None
 
 
 def grip_elsewhere(lifted: LiftedTracks) -> dict[str, Any] | None:
-    """The frame in which a hand comes back to another part of the object."""
+    """The frame in which a hand returns and grasps another part of the object."""
     frame = lifted.facts.get("grip_elsewhere")
     return None if frame is None else {"where": "controllers", "value": int(frame), "frames": (int(frame),)}

@@ -1,8 +1,12 @@
-"""The contact sheet of a capture: one row per camera, the first frame, those at one and two thirds, and the last.
+"""The contact sheet of a capture: one row per camera with the first frame, those at one and two thirds, and the last.
 
-Each image shows outlines of the masks, controllers and annotated points, the table z = 0 as a grid of 10 cm with the axes of the
-world (x red, y green, z blue), and surfaces that the other cameras measured, in their colors. A wrong pose, unit, order of cameras
-or time is visible: grids that do not lie on the table, dots that miss the object, outlines beside it.
+Each image shows:
+
+- outlines of the masks, controllers and annotated points
+- the table z = 0 as a grid of 10 cm, with the axes of the world (x red, y green, z blue)
+- surface points of the other cameras, one color per camera
+
+A wrong pose, unit, camera order or time is visible: grids are off the table, dots miss the object, or outlines do not match it.
 """
 
 from __future__ import annotations
@@ -18,16 +22,16 @@ from neuspring.data.capture import OBJECT, Capture
 from neuspring.data.frames import TINTS
 
 SHEET_FILE, SHEET_TILE = "contact_sheet.jpg", 480
-"""The file in the capture's folder, and the width of an image in it, pixels."""
+"""Name of the file in the capture's folder, and the width of one image in it, px."""
 CAMERA_TINTS = ((255, 140, 0), (240, 50, 220), (60, 220, 255), (250, 230, 30))
-"""RGB of the dots that a camera measured."""
+"""RGB of a camera's surface points in the other images."""
 AXIS_TINTS = ((255, 60, 60), (60, 230, 60), (90, 140, 255))
 SQUARE = 0.1
-"""m: side of a square of the grid on the table."""
+"""Side of a square of the table's grid, m."""
 
 
 def draw_sheet(capture: Capture, controllers: np.ndarray, annotated: np.ndarray, path: Path) -> None:
-    """Write the contact sheet with controllers and annotated points [T, n, 3], m. Raises InputError where it cannot be written."""
+    """Write the contact sheet; controllers and annotated points are [T, n, 3], m. Raises InputError if it cannot be written."""
     frames = sorted({round(part * (capture.frame_count - 1)) for part in (0, 1 / 3, 2 / 3, 1)})
     rows = [
         np.hstack([_tile(capture, controllers[frame], annotated[frame], name, frame) for frame in frames])
@@ -51,7 +55,7 @@ def draw_sheet(capture: Capture, controllers: np.ndarray, annotated: np.ndarray,
 
 
 def _tile(capture: Capture, controllers: np.ndarray, annotated: np.ndarray, name: str, frame: int) -> np.ndarray:
-    """One camera and frame, SHEET_TILE pixels wide."""
+    """The image of one camera and frame, SHEET_TILE px wide."""
     camera = capture.cameras[name]
     scale = SHEET_TILE / camera.width
     size = (SHEET_TILE, round(scale * camera.height))
@@ -76,7 +80,7 @@ def _tile(capture: Capture, controllers: np.ndarray, annotated: np.ndarray, name
 
 
 def _measured(capture: Capture, name: str, frame: int) -> np.ndarray:
-    """Points [n, 3], m, of the object that a camera measured, by its mask, else of what stands out of the table."""
+    """Points [n, 3], m, of one camera on the object's mask; without a mask, all points above the table."""
     if not capture.has(name, frame) or "depth" not in capture.streams:
         return np.zeros((0, 3))
     camera = capture.cameras[name]
@@ -94,7 +98,7 @@ def _measured(capture: Capture, name: str, frame: int) -> np.ndarray:
 
 
 def _grid(image: np.ndarray, camera: Camera, scale: float, up: float) -> None:
-    """The table around the point that the image's center sees, and the axes of the world at its origin."""
+    """Draw the grid around the image center's point on the table, and the axes at the world's origin."""
     eye = camera.camera_to_world[:3, 3]
     ray = camera.rays(np.array([camera.width, camera.height]) / 2)
     middle = eye - ray * eye[2] / ray[2] if ray[2] * eye[2] < 0 else np.zeros(3)
@@ -102,7 +106,7 @@ def _grid(image: np.ndarray, camera: Camera, scale: float, up: float) -> None:
     steps, ends = SQUARE * np.arange(-5, 6), SQUARE * 5 * np.array([-1.0, 1.0])
     for step in steps:
         for line in (np.stack([np.full(2, step), ends], axis=1), np.stack([ends, np.full(2, step)], axis=1)):
-            for color, thick in (((30, 30, 30), 2), ((235, 235, 235), 1)):  # seen on dark and light tables
+            for color, thick in (((30, 30, 30), 2), ((235, 235, 235), 1)):  # visible on dark and light tables
                 _line(image, camera, scale, np.column_stack([line + middle, np.zeros(2)]), color, thick)
     for axis, color in enumerate(AXIS_TINTS):
         tip = np.zeros(3)
@@ -113,11 +117,11 @@ def _grid(image: np.ndarray, camera: Camera, scale: float, up: float) -> None:
 def _line(image: np.ndarray, camera: Camera, scale: float, ends: np.ndarray, color: tuple[int, int, int], thick: int) -> None:
     points = ends[0] + np.linspace(0, 1, 21)[:, None] * (ends[1] - ends[0])
     pixels, depth = camera.project(points)
-    there = (depth > 0.05) & (np.abs(pixels) < 4 * max(camera.width, camera.height)).all(axis=1)
+    drawable = (depth > 0.05) & (np.abs(pixels) < 4 * max(camera.width, camera.height)).all(axis=1)
     for a, b in zip(range(20), range(1, 21), strict=True):
-        if there[a] and there[b]:
-            one, two = (tuple(int(v) for v in np.round(scale * pixels[k])) for k in (a, b))
-            cv2.line(image, one, two, color, thick, cv2.LINE_AA)
+        if drawable[a] and drawable[b]:
+            start, stop = (tuple(int(v) for v in np.round(scale * pixels[k])) for k in (a, b))
+            cv2.line(image, start, stop, color, thick, cv2.LINE_AA)
 
 
 def _dots(image: np.ndarray, camera: Camera, scale: float, points: np.ndarray, color: tuple[int, int, int], radius: int) -> None:

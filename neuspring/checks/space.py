@@ -1,4 +1,4 @@
-"""Points in space that a capture brings: units and axes, and hands that must reach the object."""
+"""Points in space of a capture's files: units, axes, and contact between hands and object."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from neuspring.checks.objects import HAND_REACH, extents
 from neuspring.checks.rig import FAR_OFF
 
 UNITS = {"millimeters": 1000.0, "tenths of a millimeter": 10000.0, "centimeters": 100.0}
-"""Units that may have been meant, and how many are in 1 m."""
+"""Possible wrong units, and their number per m."""
 AWAY = 0.3
-"""m. Hands that never come nearer to the nodes are of another scene."""
+"""Distance from the nodes, m, above which hands belong to another scene."""
 SAME = 1e-4
-"""m: nodes nearer than this are one, and no spring is between them."""
+"""Distance, m, below which two points are the same; no spring can connect them."""
 
 
 def far(points: np.ndarray, *_: Any) -> dict[str, Any]:
-    """The largest coordinate of points [n, 3] of a file, and the units in which it would be near."""
+    """The largest coordinate of points [n, 3] of a file, and the units in which it would be plausible."""
     most = float(np.abs(points).max())
     size = " x ".join(f"{side:.3g}" for side in np.ptp(points, axis=0))
     fitting = [f"divide by {by:g} if they are {unit}" for unit, by in UNITS.items() if 0.05 < most / by < 10]
-    return {"value": most, "detail": f"a box of {size}", "next": f"Write meters: {' or '.join(fitting) or 'look at the unit'}."}
+    return {"value": most, "detail": f"bounding box {size}", "next": f"Write meters: {' or '.join(fitting) or 'check the unit'}."}
 
 
 def travel(points: np.ndarray) -> np.ndarray:
-    """The largest mean displacement [3], m, of points [T, K, 3] from their places in frame 0."""
+    """The largest mean displacement [3], m, of points [T, K, 3] from frame 0."""
     mean = np.nan_to_num(points - points[0]).sum(axis=1) / max(points.shape[1], 1)
     return np.asarray(mean[np.linalg.norm(mean, axis=1).argmax()])
 
 
 def off_table(points: np.ndarray, up: float | None, moved: np.ndarray) -> dict[str, Any] | None:
-    """Lowest height of points above the table, m; `up` is +1 or -1, None without a table. `moved` [3], m."""
+    """Lowest height above the table, m, of points [n, 3], m; `up` is +1, -1, or None without a table; `moved` [3] is `travel`."""
     if up is None:
         return None
     low, high = extents(points * (1, 1, up))[:, 2].tolist()
@@ -43,7 +43,7 @@ def off_table(points: np.ndarray, up: float | None, moved: np.ndarray) -> dict[s
 
 
 def off_body(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
-    """Largest distance of annotated points of frame 0 [K, 3], m, NaN where unseen, from the nodes [N, 3] of the object."""
+    """Largest distance, m, between annotated points of frame 0 [K, 3] (NaN: not annotated) and the nodes [N, 3]."""
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     if not len(known):
         return None
@@ -53,7 +53,7 @@ def off_body(points: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
 
 
 def reach(held: np.ndarray, nodes: np.ndarray) -> dict[str, Any] | None:
-    """Least distance of controllers that hold [n, 3] from the nodes [N, 3], m."""
+    """Smallest distance between grasping controllers [n, 3] and nodes [N, 3], m."""
     if not len(nodes) or not len(held):
         return None
     gap = float(KDTree(nodes).query(held)[0].min())

@@ -1,9 +1,9 @@
-"""Data that everything is made of: the capture folder, and pickles of others without their code.
+"""Data formats: the capture folder, its images, planes in depth, C3D files, and safe reading of pickles.
 
-- `camera`: a calibrated camera, its lens, a plane that it sees. `capture`: the capture folder (cameras, frames, masks) and its
-  writer.
-- `images`, `frames`: its pictures, and what several steps do with them. `results`: what the steps of perception hand on.
-- `c3d`: markers of motion capture. `unpickle`: the only way in which pickles are read. `tables`: CSV tables that ship.
+- `camera`: a calibrated camera, its lens, and a plane that it sees. `planes`: planes in depth images.
+- `capture`: the capture folder (cameras, frames, masks) and its writer. `images`, `frames`: its images.
+- `results`: the files that steps of perception pass on.
+- `c3d`: markers of motion capture. `unpickle`: the only reader of pickles. `tables`: CSV tables of the package.
 
-Importing this package loads none of them. README.md here is the page for users of captures.
+Importing this package loads no submodule. README.md is the user's page about captures.
 """

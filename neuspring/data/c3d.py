@@ -1,7 +1,7 @@
-"""Markers of a C3D file, by ezc3d: FILE.c3d has all of them, FILE.c3d#LABEL,LABEL those that are named, in that order.
+"""Markers of C3D files, read with ezc3d.
 
-FILE.c3d#unit=mm says the unit of a file that has none; labels may follow. A marker is lost where its residual is negative or not
-finite, whatever is written in its place; it may well be at (0, 0, 0).
+`FILE.c3d` selects all markers, and `FILE.c3d#LABEL,LABEL` the named ones in this order. `FILE.c3d#unit=mm` states the unit of a
+file without one; labels may follow. A marker is lost where its residual is negative or not finite, whatever position is stored.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ FORM = re.compile(r"(?P<file>.+?\.c3d)(#(unit=(?P<unit>\w+)(,|$))?(?P<labels>.*)
 C3D_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
 """m per unit."""
 C3D_BLOCK = 512
-"""Bytes: data begin and end at multiples. Word 4 of the header is the first frame's number, word 9 the block where data start."""
+"""Bytes. Data begin and end at multiples. Word 4 of the header is the number of the first frame, word 9 the first block of data."""
 SGI = 86
-"""Processor of a file, byte 4 of its parameters; 84: Intel, 85: DEC."""
+"""Code of SGI processors, byte 4 of the parameters; 84 is Intel, 85 is DEC."""
 
 
 def is_c3d(path: Path) -> bool:
@@ -31,7 +31,7 @@ def is_c3d(path: Path) -> bool:
 
 
 def plain_file(path: Path) -> Path:
-    """The file itself."""
+    """The path without unit and labels."""
     form = FORM.fullmatch(str(path))
     return Path(form["file"]) if form else path
 
@@ -46,13 +46,13 @@ class Markers:
     rate: float
     """Frames per second."""
     first: int = 1
-    """Number of its first frame in the take, from 1."""
+    """Number of the first frame in the recording, from 1."""
 
     @classmethod
     def read(cls, path: Path) -> Markers:
-        """Those that `path` names. Raises InputError."""
+        """Read the markers that `path` selects. Raises InputError."""
         ezc3d, form, file = needed("ezc3d"), FORM.fullmatch(str(path)), plain_file(path)
-        assert form is not None, "asked for by is_c3d"
+        assert form is not None, "is_c3d accepts the path"
         head = _head(file)
         try:
             content = ezc3d.c3d(str(file))
@@ -63,38 +63,42 @@ class Markers:
         _require_whole(file, head, content, *points.shape[:2])
         keys = takewhile(lambda key: key in about, (f"LABELS{k}" if k > 1 else "LABELS" for k in count(1)))
         labels = [label.strip() for key in keys for label in about[key]["value"]][: points.shape[1]]
-        said = next(iter(about.get("UNITS", {}).get("value", [])), "").strip().lower()
-        unit = form["unit"] or said
-        if unit not in C3D_UNITS or said not in (unit, ""):
-            rule = f"POINT:UNITS must be one of {' '.join(C3D_UNITS)}, or be said if the file does not say it"
-            asked = ",".join(["unit=mm", *filter(None, [form["labels"]])])
+        file_unit = next(iter(about.get("UNITS", {}).get("value", [])), "").strip().lower()
+        unit = form["unit"] or file_unit
+        if unit not in C3D_UNITS or file_unit not in (unit, ""):
+            rule = f"POINT:UNITS must be one of {' '.join(C3D_UNITS)}; unit= is only for files without a unit"
+            options = ",".join(["unit=mm", *filter(None, [form["labels"]])])
             remedy = (
-                f"Say it, {file}#{asked}" if not said else "Leave unit= out." if said in C3D_UNITS else "Export it in one of them."
+                f"State the unit: {file}#{options}"
+                if not file_unit
+                else "Remove unit=."
+                if file_unit in C3D_UNITS
+                else "Export the file in one of these units."
             )
-            raise InputError(path, rule, f"{said or 'none'} in the file, {form['unit'] or 'none'} given", remedy)
+            raise InputError(path, rule, f"{file_unit or 'none'} in the file, {form['unit'] or 'none'} in the path", remedy)
         names = form["labels"].split(",") if form["labels"] else labels
         for name in names if form["labels"] else ():
             if labels.count(name) != 1:
-                raise InputError(path, "labels of one marker each are required", repr(name), f"There are: {' '.join(labels)}.")
+                raise InputError(path, "each label must name exactly one marker", repr(name), f"Labels: {' '.join(labels)}.")
         rate = float(about["RATE"]["value"][0])
-        # ezc3d 1.7.2 exchanges residual and camera byte of a point, but a lost one is -1 in both.
+        # ezc3d 1.7.2 swaps residual and camera byte of a point; a lost point has -1 in both.
         lost = ~(data["meta_points"]["residuals"][0].T >= 0) | ~np.isfinite(points).all(axis=2)
         points = np.where(lost[..., None], np.nan, points * C3D_UNITS[unit])
         chosen = [labels.index(name) for name in names] if form["labels"] else slice(None)
         return cls(points[:, chosen], tuple(names), rate, int.from_bytes(head[6:8], "little"))
 
     def whole(self, path: Path) -> np.ndarray:
-        """Their points, if none is lost. Raises InputError."""
+        """The points [T, K, 3], m. Raises InputError if a marker is lost in any frame."""
         for label, lost in zip(self.labels, np.isnan(self.points[..., 0]).T, strict=False):
             if lost.any():
                 rule = f"{label}: a controller must be seen in every frame"
-                remedy = "Fill its gaps where it was recorded, or name markers that are never lost: FILE.c3d#LABEL,LABEL."
+                remedy = "Fill its gaps in the recording software, or select markers that are never lost: FILE.c3d#LABEL,LABEL."
                 raise InputError(path, rule, f"lost in {lost.sum()} frames, first in {int(lost.argmax())}", remedy)
         return self.points
 
 
 def _head(file: Path) -> bytes:
-    """The header. Raises InputError for a file of an SGI processor, whose numbers have the other order of bytes."""
+    """The header of the file. Raises InputError for files of SGI processors, which have the opposite byte order."""
     try:
         with file.open("rb") as stream:
             head = stream.read(C3D_BLOCK)
@@ -103,12 +107,12 @@ def _head(file: Path) -> bytes:
     except (OSError, IndexError) as error:
         raise InputError(file, "a C3D file is required", str(error)) from error
     if processor == bytes([SGI]):
-        raise InputError(file, "numbers of Intel or DEC processors are required", "SGI (MIPS)", "Export it for Intel (PC).")
+        raise InputError(file, "the byte order of Intel or DEC is required", "SGI (MIPS)", "Export the file for Intel (PC).")
     return head
 
 
 def _require_whole(file: Path, head: bytes, content: dict, frames: int, points: int) -> None:
-    """Raise InputError where the file holds more frames than it counts: the format's counter ends at 65,535."""
+    """Raise InputError if the file contains more frames than its counter states; the counter ends at 65,535."""
     about, data = content["parameters"]["POINT"], content["data"]
     if not frames or not points or np.size(data.get("rotations", ())):
         return
@@ -116,5 +120,5 @@ def _require_whole(file: Path, head: bytes, content: dict, frames: int, points: 
     each = width * (4 * points + np.size(data["analogs"]) // frames)
     held = (file.stat().st_size - C3D_BLOCK * (int.from_bytes(head[16:18], "little") - 1)) // each
     if (held - frames) * each > C3D_BLOCK:
-        rule = "the frames that the file counts must be all that it holds: its counter ends at 65,535"
-        raise InputError(file, rule, f"{frames} of {held}", "Export it in parts.")
+        rule = "the file must not contain more frames than its counter states (at most 65,535)"
+        raise InputError(file, rule, f"{held} frames, {frames} counted", "Export the recording in several files.")

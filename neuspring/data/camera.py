@@ -1,4 +1,4 @@
-"""A calibrated camera, its lens, a plane that it sees, and the limits of what cameras on a table are."""
+"""Calibrated cameras, their lenses, the planes that they see, and the limits of a plausible table."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pydantic import Field
 from neuspring.core.section import STRICT, Finite, Name
 
 NEAR, FAR = 0.1, 10.0
-"""m. Median depths outside this range are no table in a room."""
+"""m. A median depth outside this range does not come from a table in a room."""
 ROLL = 60.0
-"""Degrees. The normal of a table leans from the upward direction of the image by less, that of a side wall or a ceiling by more."""
+"""Degrees. The normal of a table is closer than this to the image's upward direction; those of side walls and ceilings are not."""
 Row3: TypeAlias = tuple[Finite, Finite, Finite]
 Row4: TypeAlias = tuple[Finite, Finite, Finite, Finite]
 
@@ -36,7 +36,7 @@ class Camera:
     """[4, 4], m."""
 
     def entry(self, missing: tuple[int, ...] = ()) -> CameraEntry:
-        """Its entry in capture.json, with the frames that it misses."""
+        """The entry of this camera in capture.json, with its `missing` frames."""
         intrinsics: Any = tuple(map(tuple, self.intrinsics.tolist()))
         pose: Any = tuple(map(tuple, self.camera_to_world.tolist()))
         return CameraEntry(
@@ -60,7 +60,7 @@ class Camera:
         return flat[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None], depth
 
     def sees(self, pixels: np.ndarray) -> np.ndarray:
-        """True for pixels (x, y) [..., 2] that round to one of the image."""
+        """True for pixels (x, y) [..., 2] that round to a pixel of the image."""
         x, y = np.round(pixels[..., 0]), np.round(pixels[..., 1])
         return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
@@ -72,11 +72,11 @@ class Lens:
     matrix: np.ndarray
     """K [3, 3], pixels."""
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Coefficients; none: no distortion."""
+    """Coefficients; empty: no distortion."""
     model: str = "none"
     """Model of the distortion: none, opencv or fisheye."""
     size: tuple[int, int] | None = None
-    """(width, height) for which it holds, where it is said."""
+    """(width, height) of its images; None: not stated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,29 +84,29 @@ class Plane:
     """A plane that a camera sees."""
 
     normal: np.ndarray
-    """Unit normal [3] in the coordinates of the camera, towards the camera."""
+    """Unit normal [3] in camera coordinates, towards the camera."""
     height: float
-    """Distance of the camera, m."""
+    """Distance of the camera from the plane, m."""
     rms: float
     """Root mean square distance of its points, m."""
     share: float
-    """Its part of the points with depth."""
+    """Fraction of the points with depth that are on the plane."""
     inliers: int
-    """Its points, of at most `planes.CLOUD_POINTS`."""
+    """Number of points on the plane, of at most `planes.CLOUD_POINTS`."""
     points: np.ndarray
-    """They themselves [n, 3], m, in the coordinates of the camera."""
+    """The points on the plane [n, 3], m, in camera coordinates."""
 
     @property
     def elevation(self) -> float:
-        """Angle by which the camera looks down at it, degrees: 90 from straight above, 0 along it."""
+        """Angle between the optical axis and the plane, degrees: 90 from straight above, 0 along it."""
         return float(np.degrees(np.arcsin(np.clip(-self.normal[2], -1.0, 1.0))))
 
     def above(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance [...], m, of points [..., 3] in the coordinates of the camera; the camera's side is positive."""
+        """Signed distance [...], m, of points [..., 3] in camera coordinates; the camera's side is positive."""
         return np.asarray(points @ self.normal + self.height)
 
     def text(self) -> str:
-        """Its size and place, in one line."""
+        """Size and position of the plane, in one line."""
         size = f"{1e3 * self.rms:.1f} mm rms over {self.share:.0%} of the pixels with depth ({self.inliers} points)"
         return f"{size}, camera {self.height:.3f} m above it, looking down at it by {self.elevation:.0f} degrees"
 
@@ -117,7 +117,7 @@ class CameraEntry:
 
     __pydantic_config__ = STRICT
     name: Name
-    """Its folder under color, depth and mask."""
+    """Name of its folders in color, depth and mask."""
     width: Annotated[int, Field(ge=16)]
     height: Annotated[int, Field(ge=16)]
     intrinsics: tuple[Row3, Row3, Row3]
@@ -125,7 +125,7 @@ class CameraEntry:
     camera_to_world: tuple[Row4, Row4, Row4, Row4]
     """Rigid, m."""
     missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    """Frames that this camera does not have."""
+    """Frames without an image of this camera."""
 
     def camera(self) -> Camera:
         """The calibrated camera."""

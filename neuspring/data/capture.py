@@ -1,17 +1,18 @@
-"""The capture folder: RGBD video of one or more cameras, color alone of one, or points in space alone.
+"""The capture folder: RGBD video of one or more cameras, color video of one camera, or points in space without video.
 
-    capture.json                       everything but images, see `Description`
+    capture.json                       all settings, see `Description`
     color/<camera>/<frame>.png         8-bit RGB
     depth/<camera>/<frame>.png | .npy  uint16 in units of `depth_unit` m (png, npy) or float meters (npy); along the optical axis,
-                                       0: none; not there with `depth: none`
+                                       0: no depth; absent with `depth: none`
     mask/<camera>/<frame>.png          optional: 8-bit, 0 nothing, 1 object, 2 hands, 3 person
     tracks.json                        optional: [K][T] of [x, y, z] m in the world, or null where not annotated; see `tracks`
-    controllers.npz|csv, nodes.npz|ply, rest.npz optional: hands in all frames, the body of frame 0, its unloaded shape (points.py)
-    points.json                        optional, for scoring alone: {camera: [K][T] of [x, y] pixels, or null where not marked}
+    controllers.npz|csv                optional: controllers in all frames (points.py)
+    nodes.npz|ply, rest.npz            optional: nodes of the object in frame 0, and points of its unloaded shape (points.py)
+    points.json                        optional, only for scoring: {camera: [K][T] of [x, y] pixels, or null where not annotated}
 
-Frames are numbered from 0 with five digits. Pixel centers lie at whole coordinates, x right, y down, z forward (OpenCV). The world
-is right-handed, meters, the table at z = 0. Cameras may differ in size. A frame that a camera missed is listed in its `missing`
-and has no files.
+Frames are numbered from 0 with five digits. Pixel centers have integer coordinates: x right, y down, z forward (OpenCV). The world
+is right-handed, in meters, with the table at z = 0. Cameras may differ in size. The key `missing` of a camera lists frames without
+files.
 """
 
 from __future__ import annotations
@@ -47,19 +48,19 @@ from neuspring.data.images import make_way, read_array, read_image, write_image
 CAPTURE, TRACKS, POINTS = "capture.json", "tracks.json", "points.json"
 CONTROLLERS, NODES, REST = ("controllers.npz", "controllers.csv"), ("nodes.npz", "nodes.ply"), "rest.npz"
 RECIPE = ".make-capture.json"
-"""Recipe of a folder that make-capture has not finished. It is removed at the end."""
+"""Recipe of an unfinished folder; make-capture removes it at the end."""
 NOTHING, OBJECT, HANDS, PERSON = 0, 1, 2, 3
 """Labels of masks."""
 FEWEST_FRAMES = 5
-"""Frames of a capture."""
+"""Smallest number of frames of a capture."""
 THIN = ("cloth", "package")
-"""Categories of which no volume is made; those of all other words are filled."""
+"""Categories without interior nodes; objects of all other categories are filled."""
 LEFT_OUT = ("depth", "tracks", "pose", "mass")
-"""Fields of capture.json that are not written where they have their default."""
+"""Fields that capture.json omits at their default."""
 TEXT_TOLERANCE = 1e-4
-"""Allowed deviation from R^T R = 1 in JSON, where matrices may have five digits."""
+"""Allowed deviation from R^T R = 1 in JSON, whose matrices may have only five digits."""
 FEW_DIGITS = 0.03
-"""That of a matrix with two decimals."""
+"""Deviation from R^T R = 1 that two decimals explain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,31 +74,31 @@ class Description:
     """Kind of object: cloth, rope, package, ..."""
     frame_count: Annotated[int, Field(ge=FEWEST_FRAMES)]
     frame_rate: Annotated[float, Field(ge=1, le=2000)]
-    """Frames per second at which it was recorded."""
+    """Recorded frames per second."""
     cameras: tuple[CameraEntry, ...]
-    """None: points in space alone, with `depth: none` and `tracks: train` (points.py)."""
+    """Empty: points in space without video, with `depth: none` and `tracks: train` (points.py)."""
     depth: Literal["measured", "none"] = "measured"
-    """The lifter of the capture (`LIFTERS` of neuspring/perception/backends.py). none: color of one camera alone, or no camera."""
+    """The lifter of the capture (`LIFTERS` of neuspring/perception/backends.py). none: color of one camera, or no camera."""
     tracks: Literal["score", "train"] = "score"
-    """score: annotated points are for scoring alone. train: those of training frames teach the twin too."""
+    """score: annotated points are only for scoring. train: the fit also uses them in training frames."""
     depth_unit: Positive = 0.001
     """Meters per count of an integer depth image."""
     depth_format: Literal["png", "npy"] = "png"
     pose: Literal["lying", "standing"] | None = None
-    """Pose of the object in frame 0, where `depth` is none and it is neither a sheet nor a rope. null: not known; what would lie
-    too far behind rises."""
+    """Pose of the object in frame 0 if `depth` is none and it is neither a sheet nor a rope. null: unknown; parts that would be too
+    far from the camera are raised."""
     up: Literal["+z", "-z"] = "+z"
     """Direction of up along the world's z axis."""
     train_end: Annotated[int, Field(ge=2)] | None = None
     """Training frames are [0, train_end); null: the first 70 %."""
     masks: bool = False
-    """True where the capture has masks."""
+    """True if the capture has masks."""
     self_collision: bool | None = None
-    """True where the object may touch itself, for a scenario without a row of its own; null: where the category is cloth."""
+    """True if the object may touch itself, for scenarios without a line in the table. null: true for the category cloth."""
     ground: bool = True
-    """True where there is a table, for a scenario without a row of its own."""
+    """True if there is a table, for scenarios without a line in the scenario table."""
     mass: Positive | None = None
-    """Mass of the object, kg, for exports, which are of 1 kg per node without it."""
+    """Mass of the object, kg, for exports; without it, each node weighs 1 kg."""
     provenance: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -108,14 +109,14 @@ class Description:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A capture folder, its images read on demand."""
+    """A capture folder; images are read on demand."""
 
     folder: Path
     description: Description
 
     @classmethod
     def load(cls, folder: Path) -> Capture:
-        """Read capture.json and check the calibration. Raises InputError naming file and field."""
+        """Read capture.json and check the calibration. Raises InputError with file and field."""
         folder = Path(folder)
         path = folder / CAPTURE
         description = read_description(path)
@@ -124,7 +125,7 @@ class Capture:
 
     @staticmethod
     def begun(folder: Path) -> bool:
-        """True where a folder holds a capture, or one that is not finished."""
+        """True if a folder contains a capture, finished or not."""
         return (folder / CAPTURE).exists() or (folder / RECIPE).exists()
 
     @cached_property
@@ -134,7 +135,7 @@ class Capture:
 
     @property
     def frame_count(self) -> int:
-        """Frames, missing ones included."""
+        """Number of frames, including missing ones."""
         return self.description.frame_count
 
     @property
@@ -144,17 +145,17 @@ class Capture:
 
     @cached_property
     def streams(self) -> frozenset[str]:
-        """The kinds of images that its cameras have: color, depth, mask."""
+        """The kinds of images in the capture: color, depth, mask."""
         stored = {"color": bool(self.cameras), "depth": self.description.depth == "measured", "mask": self.description.masks}
         return frozenset(name for name, there in stored.items() if there)
 
     def require_camera(self, name: str) -> None:
-        """Raise InputError if there is no such camera."""
+        """Raise InputError unless the capture has this camera."""
         if name not in self.cameras:
             raise InputError(self.folder / CAPTURE, f"must have a camera {name}", sorted(self.cameras))
 
     def has(self, camera: str, frame: int) -> bool:
-        """True where the camera has this frame."""
+        """True if the camera has this frame."""
         return frame not in self._missing[camera]
 
     @cached_property
@@ -163,7 +164,7 @@ class Capture:
 
     @cached_property
     def repeats(self) -> dict[str, dict[str, list[int]]]:
-        """Camera -> stream -> frames whose image equals the one before it to the bit: sensors have noise, so it is no new image."""
+        """Camera -> stream -> frames whose image equals the previous one bit by bit; sensor noise rules this out for new images."""
         return {
             name: {
                 kind: [int(there.stem) for here, there in pairwise(files) if filecmp.cmp(here, there, shallow=False)]
@@ -174,7 +175,7 @@ class Capture:
         }
 
     def shows(self, camera: str, frame: int) -> bool:
-        """True where the camera has this frame and none of its images repeats the one before."""
+        """True if the camera has this frame and none of its images repeats the previous one."""
         return self.has(camera, frame) and frame not in chain(*self.repeats[camera].values())
 
     def path(self, what: Literal["color", "depth", "mask"], camera: str, frame: int) -> Path:
@@ -187,7 +188,7 @@ class Capture:
         return self._image("color", camera, frame, cv2.IMREAD_COLOR)[..., ::-1]
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
-        """Depth [H, W], m, 0 where nothing was measured: everywhere with `depth: none`. Raises InputError."""
+        """Depth [H, W], m; 0 where nothing was measured, and everywhere with `depth: none`. Raises InputError."""
         if "depth" not in self.streams:
             return np.zeros((self.cameras[camera].height, self.cameras[camera].width))
         path = self.path("depth", camera, frame)
@@ -209,12 +210,12 @@ class Capture:
         return read_image(self.path(what, camera, frame), self.cameras[camera], flag, self._absent(camera))
 
     def _absent(self, camera: str) -> str:
-        return f"List the frame in cameras.{camera}.missing of {CAPTURE} if the camera does not have it."
+        return f"If the camera does not have this frame, list it in cameras.{camera}.missing of {CAPTURE}."
 
     def tracks(self, path: Path | None = None) -> np.ndarray:
         """Annotated tracks [T, K, 3], m, NaN where not annotated; K = 0 without tracks.json. Raises InputError.
 
-        `path`: another file, JSON or C3D.
+        `path` selects another file, JSON or C3D.
         """
         path = path or self.folder / TRACKS
         if is_c3d(path):
@@ -225,16 +226,16 @@ class Capture:
         return _read_tracks(path, load_json(path) if path.exists() else [], self.frame_count, 3)
 
     def points(self, camera: str) -> np.ndarray:
-        """Points marked in the images of a camera [T, K, 2], pixels, NaN where not marked; K = 0 without any. Raises InputError."""
+        """Annotated points in the images of a camera [T, K, 2], pixels, NaN where not annotated; K = 0: none. Raises InputError."""
         path = self.folder / POINTS
         listed = load_json(path) if path.exists() else {}
         if not isinstance(listed, dict):
-            raise InputError(path, "an object of tracks by camera is required", type(listed).__name__)
+            raise InputError(path, "a JSON object {camera: tracks} is required", type(listed).__name__)
         return _read_tracks(path, listed.get(camera, []), self.frame_count, 2)
 
 
 def _read_tracks(path: Path, listed: object, frames: int, size: int) -> np.ndarray:
-    """Tracks [T, K, size] of [K][T] lists, null as NaN. Raises InputError."""
+    """Tracks [T, K, size] from [K][T] lists, with NaN for null. Raises InputError."""
     if listed == []:
         return np.zeros((frames, 0, size))
     if not isinstance(listed, list):
@@ -249,13 +250,13 @@ def _read_tracks(path: Path, listed: object, frames: int, size: int) -> np.ndarr
         raise InputError(path, f"every track needs {frames} entries", tracks.shape[1])
     unseen = np.array([[point is None for point in track] for track in listed], dtype=bool)
     if (odd := np.argwhere(~np.isfinite(tracks).all(axis=2) & ~unseen)).size:
-        rule = "coordinates must be finite; where a point is not seen, its entry is null"
+        rule = "coordinates must be finite; write null where a point is not seen"
         raise InputError(path, rule, f"point {odd[0, 0]}, frame {odd[0, 1]}: {tracks[tuple(odd[0])].tolist()}")
     return np.swapaxes(tracks, 0, 1)
 
 
 class Writer:
-    """Writes a capture folder, image by image, capture.json last: a folder without it is not a capture."""
+    """Writes a capture folder image by image, and capture.json last: without it a folder is not a capture."""
 
     def __init__(self, folder: Path, description: Description) -> None:
         self.capture = Capture(Path(folder), description)
@@ -263,7 +264,7 @@ class Writer:
             (self.capture.folder / name).unlink(missing_ok=True)
 
     def frame(self, camera: str, frame: int, color: np.ndarray, depth: np.ndarray | None, mask: np.ndarray | None = None) -> None:
-        """RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), labels uint8 [H, W]."""
+        """Write RGB uint8 [H, W, 3], depth as stored [H, W] (None with `depth: none`), and labels uint8 [H, W]."""
         write_image(self.capture.path("color", camera, frame), color[..., ::-1])
         path = self.capture.path("depth", camera, frame)
         if depth is not None and path.suffix == ".png":
@@ -275,7 +276,7 @@ class Writer:
             self.mask(camera, frame, mask)
 
     def link(self, kind: Literal["color", "depth"], camera: str, frame: int, source: Path) -> None:
-        """An image that is there in the capture's form: linked where the file system allows it, else copied."""
+        """Add an image that already has the capture's format: linked if the file system allows it, else copied."""
         make_way(path := self.capture.path(kind, camera, frame))
         try:
             os.link(source, path)
@@ -283,14 +284,16 @@ class Writer:
             shutil.copyfile(source, path)
 
     def mask(self, camera: str, frame: int, labels: np.ndarray) -> None:
-        """Labels uint8 [H, W]: 0 nothing, 1 object, 2 hands, 3 person."""
+        """Write labels uint8 [H, W]: 0 nothing, 1 object, 2 hands, 3 person."""
         write_image(self.capture.path("mask", camera, frame), labels)
 
     def finish(
         self, tracks: np.ndarray | None = None, points: Mapping[str, np.ndarray] | None = None, **provenance: str
     ) -> Capture:
-        """Write capture.json, with a digest of all images in its provenance; before it tracks [T, K, 3], m, and points [T, K, 2],
-        pixels, by camera, both NaN where not annotated."""
+        """Write tracks [T, K, 3], m, and points [T, K, 2], pixels, by camera (NaN where not annotated), then capture.json.
+
+        The provenance contains a digest of all images.
+        """
         folder, before = self.capture.folder, self.capture.description
         description = replace(before, provenance={**before.provenance, "images": images_digest(folder), **provenance})
         if tracks is not None:
@@ -306,12 +309,12 @@ class Writer:
 
 
 def write_tracks(folder: Path, tracks: np.ndarray) -> None:
-    """Write tracks.json of a capture's folder from tracks [T, K, 3], m, NaN where not annotated."""
+    """Write tracks [T, K, 3], m, NaN where not annotated, to tracks.json of a capture's folder."""
     write_text(folder / TRACKS, json.dumps(_listed(tracks)) + "\n")
 
 
 def _listed(tracks: np.ndarray) -> list[list[list[float] | None]]:
-    """Tracks [T, K, n] as JSON holds them, [K][T], null where not annotated."""
+    """Tracks [T, K, n] in the form of the JSON file: [K][T], null where not annotated."""
     return [
         [None if np.isnan(point).any() else [round(float(v), 6) for v in point] for point in track]
         for track in np.swapaxes(tracks, 0, 1)
@@ -319,7 +322,7 @@ def _listed(tracks: np.ndarray) -> list[list[list[float] | None]]:
 
 
 def images_digest(folder: Path) -> str:
-    """SHA-256 over names and contents of all images of a capture's folder."""
+    """SHA-256 of the names and contents of all images of a capture's folder."""
     digest = hashlib.sha256()
     for path in sorted(path for kind in ("color", "depth", "mask") for path in (folder / kind).rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(folder)} {digest_file(path)}\n".encode())
@@ -327,7 +330,7 @@ def images_digest(folder: Path) -> str:
 
 
 def read_description(path: Path) -> Description:
-    """capture.json, every key and type checked. Raises InputError that lists each problem."""
+    """Read capture.json and check every key and type. Raises InputError that lists all problems."""
     require_finished(path.parent)
     values = load_json(path)
     if not isinstance(values, dict):
@@ -336,14 +339,14 @@ def read_description(path: Path) -> Description:
 
 
 def require_finished(folder: Path) -> None:
-    """Raise InputError for a folder that make-capture has begun and not finished."""
+    """Raise InputError for a folder that make-capture has not finished."""
     if (folder / RECIPE).exists() and not (folder / CAPTURE).exists():
-        remedy = "Give the same make-capture command again: it goes on where it stopped."
-        raise InputError(folder, "a whole capture is required", "one that make-capture has not finished", remedy)
+        remedy = "Rerun the same make-capture command to resume."
+        raise InputError(folder, "a complete capture is required", "one that make-capture has not finished", remedy)
 
 
 def description_findings(path: Path, description: Description) -> list[Finding]:
-    """Rules that types cannot express: calibration, frame numbers, the split."""
+    """Findings about rules that types cannot express: calibration, frame numbers, the split."""
     findings = []
     names = [camera.name for camera in description.cameras]
     if len(set(names)) < len(names):
@@ -352,10 +355,10 @@ def description_findings(path: Path, description: Description) -> list[Finding]:
         rule = f"must be at most frame_count = {description.frame_count}"
         findings.append(broken(path, "train_end", rule, description.train_end))
     if not names and (description.depth, description.tracks) != ("none", "train"):
-        rule = "at least one is required; a capture of points alone has depth: none and tracks: train"
+        rule = "at least one is required, unless depth is none and tracks is train (points in space)"
         findings.append(broken(path, "cameras", rule, f"none, depth: {description.depth} and tracks: {description.tracks}"))
     if description.depth == "none" and len(names) > 1:
-        findings.append(broken(path, "depth", "none is for one camera", f"{len(names)} cameras"))
+        findings.append(broken(path, "depth", "none allows only one camera", f"{len(names)} cameras"))
     for camera in description.cameras:
         where = f"cameras.{camera.name}"
         size = (camera.width, camera.height)
@@ -363,14 +366,14 @@ def description_findings(path: Path, description: Description) -> list[Finding]:
         findings += pose_findings(path, f"{where}.camera_to_world", np.array(camera.camera_to_world), TEXT_TOLERANCE)
         beyond = [frame for frame in camera.missing if frame >= description.frame_count]
         if beyond:
-            findings.append(broken(path, f"{where}.missing", f"frames must lie below {description.frame_count}", beyond[0]))
+            findings.append(broken(path, f"{where}.missing", f"frames must be below {description.frame_count}", beyond[0]))
         if 0 in camera.missing:
-            findings.append(broken(path, f"{where}.missing", "frame 0 is where every twin starts and must be there"))
+            findings.append(broken(path, f"{where}.missing", "frame 0, in which every twin starts, must not be missing"))
     return findings
 
 
 def intrinsics_findings(file: Path, key: str, matrix: np.ndarray, size: tuple[int, int] | None) -> list[Finding]:
-    """K [3, 3], pixels: its form, and (cx, cy) within the image of `size` (width, height), where that is known."""
+    """Findings about K [3, 3], pixels: its form, and (cx, cy) within an image of `size` (width, height), if known."""
     fixed = matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.array_equal(fixed, [0, 0, 0, 0, 1])):
         return [broken(file, key, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 is required", matrix.tolist())]
@@ -380,47 +383,47 @@ def intrinsics_findings(file: Path, key: str, matrix: np.ndarray, size: tuple[in
 
 
 def pose_findings(file: Path, key: str, pose: np.ndarray, tolerance: float) -> list[Finding]:
-    """Camera to world [4, 4], m: a rotation and a translation."""
+    """Findings about a camera-to-world pose [4, 4], m, which must be a rotation and a translation."""
     findings = []
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     mirrored = np.linalg.det(rotation) < 0
     if not error <= tolerance or mirrored or not np.isfinite(pose).all():
         rule = f"the upper left 3 x 3 block must be a rotation (rigid: orthonormal, right-handed) within {tolerance:g}"
-        seems = ", of too few digits: write six decimals" if error < FEW_DIGITS else ""
-        seems = ", and a mirror image" if mirrored else seems
-        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{seems}"))
+        hint = ", with too few digits: write six decimals" if error < FEW_DIGITS else ""
+        hint = ", and a mirror image" if mirrored else hint
+        findings.append(broken(file, key, rule, f"a deviation of {error:.3g} from R^T R = 1{hint}"))
     if not np.array_equal(pose[3], [0, 0, 0, 1]):
-        seems = ": stored by columns, transpose it" if np.array_equal(pose[:, 3], [0, 0, 0, 1]) else ""
-        findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", f"{pose[3].tolist()}{seems}"))
+        hint = ": stored by columns, transpose it" if np.array_equal(pose[:, 3], [0, 0, 0, 1]) else ""
+        findings.append(broken(file, key, "the last row must be [0, 0, 0, 1]", f"{pose[3].tolist()}{hint}"))
     return findings
 
 
 def read_labels(path: Path, camera: Camera | None = None, remedy: str = "", *, binary: bool = False) -> np.ndarray:
-    """Labels [H, W] uint8 of a mask as we or other tools write it: gray, one bit, or colors of a palette, whose indices count.
+    """Read the labels [H, W] uint8 of a mask: a gray, one-bit or palette image; the indices of a palette are the labels.
 
-    In a mask of 0 and 255 alone, and with `binary`, all but 0 is 1. Raises InputError, also where the size is not that of
-    `camera`, and with `remedy` for a missing file.
+    If all values are 0 or 255, or with `binary`, every value except 0 becomes 1. Raises InputError, also for another size than that
+    of `camera`, and with `remedy` for a missing file.
     """
     if not path.is_file():
         raise InputError(path, "this image must exist", "no such file", remedy)
     try:
-        # OpenCV replaces the indices of a palette by its colors.
+        # OpenCV would replace the indices of a palette by its colors.
         with Image.open(path) as image:
             labels = np.asarray(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(path, "this file must be a readable PNG", "a damaged file") from error
     if camera is not None and labels.shape[:2] != (camera.height, camera.width):
-        next_move = "Make them of these images, or bring them to their size without interpolation (nearest neighbor)."
+        next_move = "Make masks of these images, or resize the masks with nearest-neighbor interpolation."
         rule = f"masks must have the size of the images of camera {camera.name}, {camera.width} x {camera.height}"
         raise InputError(path, rule, f"{labels.shape[1]} x {labels.shape[0]}", next_move)
     if labels.ndim != 2:
         next_move = "Write the label of each pixel as its gray value, or a palette image whose indices are the labels."
-        raise InputError(path, "masks are gray, palette or one-bit images", f"{labels.shape[2]} channels of color", next_move)
-    found = set(np.unique(labels).tolist())
-    if found <= {0, 255} or binary:
+        raise InputError(path, "masks must be gray, palette or one-bit images", f"{labels.shape[2]} color channels", next_move)
+    values = set(np.unique(labels).tolist())
+    if values <= {0, 255} or binary:
         labels = labels > 0
-    elif max(found) > PERSON:
-        next_move = "Of two folders, of the object and of hands, `neuspring mask --masks FOLDER --hands FOLDER` makes masks."
-        raise InputError(path, "labels must be 0 (nothing), 1 (object), 2 (hands) or 3 (person)", f"label {max(found)}", next_move)
+    elif max(values) > PERSON:
+        next_move = "For separate folders of object and hands, run `neuspring mask --masks FOLDER --hands FOLDER`."
+        raise InputError(path, "labels must be 0 (nothing), 1 (object), 2 (hands) or 3 (person)", f"label {max(values)}", next_move)
     return labels.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Frames of one camera, and masks as pixels: what several steps of perception need."""
+"""Operations on the frames and masks of one camera that several steps of perception share."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ T = TypeVar("T")
 Color: TypeAlias = tuple[int, int, int]
 """RGB."""
 TINTS = {OBJECT: (40, 220, 60), HANDS: (70, 110, 255), PERSON: (150, 150, 150)}
-"""RGB of labels in pictures of masks: green, blue and gray, where the picture has other colors."""
+"""RGB of labels in figures of masks: green, blue and gray, unless the image has these colors."""
 OTHERS = ((255, 140, 0), (240, 50, 220), (250, 230, 30))
-"""Tints in their place."""
+"""Alternative tints, RGB."""
 CLEAR, TINT_AROUND = 20.0, 15
-"""Difference in a and b of Lab from which a tint is seen, and how far around a label it is compared, pixels."""
+"""Smallest visible difference in a and b of Lab, and the distance around a label within which colors are compared, pixels."""
 
 ISLAND_SHARE, ISLAND_GAP, ISLAND_AWAY, CRACK = 0.05, 0.03, 0.04, 5
-"""Largest island of an object's mask, as part of its largest piece; how far from the rest it is at least, as part of the image's
-width and, where its depth was measured, in m; and pixels between labels over which they still touch."""
+"""Limits of an island of the object's mask: largest area, as a fraction of the largest piece; smallest distance from the rest, as a
+fraction of the image width and, where depth was measured, in m; and the gap, pixels, across which labels still touch."""
 
 
 def frames_of(capture: Capture, camera: str) -> list[int]:
-    """The frames that a camera has."""
+    """The frames that are not missing for a camera."""
     return [frame for frame in range(capture.frame_count) if capture.has(camera, frame)]
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:
-    """At most `count` of the values, evenly spread from the first to the last."""
+    """At most `count` values, evenly spread from the first to the last."""
     return [values[index] for index in np.unique(np.linspace(0, len(values) - 1, count).astype(int))]
 
 
@@ -50,11 +50,11 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def without_islands(capture: Capture, camera: str, labels: np.ndarray) -> np.ndarray:
-    """Labels [T, H, W] of a camera without islands of the object: small pieces, far from the rest of it; the log says which.
+    """Remove small, distant pieces of the object from labels [T, H, W] of a camera, and print a summary.
 
-    What touches the rest, or reaches it by hands or a person, is no island.
+    A piece is kept if it touches the rest of the object, directly or through hands or a person.
     """
-    result, gone = labels.copy(), list[tuple[int, int]]()
+    result, removed = labels.copy(), list[tuple[int, int]]()
     for frame in frames_of(capture, camera):
         count, pieces, boxes, _ = cv2.connectedComponentsWithStats((labels[frame] == OBJECT).astype(np.uint8))
         if count <= 2:
@@ -68,20 +68,20 @@ def without_islands(capture: Capture, camera: str, labels: np.ndarray) -> np.nda
             islands = [piece for piece in islands if piece not in near]
             rest |= np.isin(pieces, near)
         result[frame][np.isin(pieces, islands)] = NOTHING
-        gone += [(frame, int(areas[piece])) for piece in islands]
-    if gone:
-        where = f"{len(gone)} in frames {gone[0][0]} to {gone[-1][0]}, the largest of {max(area for _, area in gone)} pixels"
-        print(f"camera {camera}: small pieces of the object's mask, far from the rest of it, went: {where}", flush=True)
+        removed += [(frame, int(areas[piece])) for piece in islands]
+    if removed:
+        extent = f"frames {removed[0][0]} to {removed[-1][0]}, at most {max(area for _, area in removed)} pixels each"
+        print(f"camera {camera}: removed {len(removed)} small distant pieces of the object's mask: {extent}", flush=True)
     return result
 
 
 def _is_apart(capture: Capture, camera: str, frame: int, piece: np.ndarray, rest: np.ndarray) -> bool:
-    """True where a piece [H, W] bool is far from the rest in the image and, where both have depth, in space."""
+    """True if a piece [H, W] bool is far from the rest in the image and, if both have depth, in space."""
     away = cv2.distanceTransform((~rest).astype(np.uint8), cv2.DIST_L2, 5)
     if away[piece].min() <= ISLAND_GAP * rest.shape[1]:
         return False
-    view, there = capture.cameras[camera], capture.path("depth", camera, frame).exists()
-    depth = capture.depth(camera, frame) if there else np.zeros(rest.shape)
+    view, has_depth = capture.cameras[camera], capture.path("depth", camera, frame).exists()
+    depth = capture.depth(camera, frame) if has_depth else np.zeros(rest.shape)
     points = []
     for part in (rest, piece):
         y, x = np.nonzero(part & (depth > 0))
@@ -90,10 +90,10 @@ def _is_apart(capture: Capture, camera: str, frame: int, piece: np.ndarray, rest
 
 
 def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
-    """The tint, RGB, of each label in pictures of this camera: the usual one if it is seen, else the one that is seen best.
+    """The tint, RGB, of each label in figures of this camera: the usual tint if it is visible, else the most visible one.
 
-    `image` [H, W, 3] and `labels` [H, W] are one frame. A tint is seen if what it makes of the label's own color differs by CLEAR
-    from nine tenths of the colors around it.
+    `image` [H, W, 3] and `labels` [H, W] are one frame. A tint is visible if the label's tinted median color differs by CLEAR from
+    nine tenths of the colors around the label.
     """
 
     def hues(colors: np.ndarray) -> np.ndarray:
@@ -102,35 +102,35 @@ def tints_of(image: np.ndarray, labels: np.ndarray) -> dict[int, Color]:
 
     chosen: dict[int, Color] = {}
     for label, usual in TINTS.items():
-        own = labels == label
-        around = cv2.dilate(own.astype(np.uint8), np.ones((2 * TINT_AROUND + 1,) * 2, np.uint8)).astype(bool) & ~own
+        inside = labels == label
+        around = cv2.dilate(inside.astype(np.uint8), np.ones((2 * TINT_AROUND + 1,) * 2, np.uint8)).astype(bool) & ~inside
         free = [tint for tint in (usual, *OTHERS) if tint not in chosen.values()]
         clear = [CLEAR]
-        if own.any() and around.any():
-            drawn = hues(tinted(np.median(image[own], axis=0), np.array(free)))
+        if inside.any() and around.any():
+            drawn = hues(tinted(np.median(image[inside], axis=0), np.array(free)))
             clear = [float(np.quantile(np.linalg.norm(hues(image[around]) - hue, axis=1), 0.1)) for hue in drawn]
         chosen[label] = usual if clear[0] >= CLEAR else free[int(np.argmax(clear))]
     return chosen
 
 
 def tinted(color: np.ndarray, tint: np.ndarray) -> np.ndarray:
-    """RGB under a tint [..., 3]."""
+    """RGB blended with a tint [..., 3]: 60 % color, 40 % tint."""
     return np.asarray(0.6 * color + 0.4 * tint)
 
 
 def overlay(image: np.ndarray, labels: np.ndarray, tints: Mapping[int, Color]) -> np.ndarray:
-    """An RGB image [H, W, 3] with the pixels of labels [H, W] tinted and their borders drawn."""
+    """An RGB image [H, W, 3] with tinted labels [H, W] and their outlines."""
     result = np.array(image, order="C")
     for label, tint in tints.items():
-        own = (labels == label).astype(np.uint8)
-        result[own > 0] = tinted(image[own > 0], np.array(tint)).astype(np.uint8)
-        outlines, _ = cv2.findContours(own, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        inside = (labels == label).astype(np.uint8)
+        result[inside > 0] = tinted(image[inside > 0], np.array(tint)).astype(np.uint8)
+        outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(result, outlines, -1, tint, 1)
     return result
 
 
 def write_png(path: Path, image: np.ndarray) -> Path:
-    """Write RGB [H, W, 3], RGBA [H, W, 4] or a mask [H, W], uint8, whole or not at all; a link is replaced, not followed."""
+    """Write RGB [H, W, 3], RGBA [H, W, 4] or a mask [H, W], uint8, atomically; a link is replaced, not followed."""
     pixels = image[..., [2, 1, 0, 3][: image.shape[2]]] if image.ndim == 3 else image
     ok, png = cv2.imencode(".png", np.ascontiguousarray(pixels))
     assert ok, "an image can be encoded"

@@ -1,8 +1,8 @@
-"""Planes in depth.
+"""Planes in depth images.
 
-A plane is n . x + h = 0 in the coordinates of the camera (OpenCV: x right, y down, z forward, m). Its unit normal n points to the
-camera, so that h > 0 is the camera's height above it. It is found by RANSAC, then by weighted least squares: residuals count in
-units of the sensor's noise, which grows with depth (`camera.depth_noise`).
+A plane is n . x + h = 0 in camera coordinates (OpenCV: x right, y down, z forward, m). Its unit normal n points to the camera, so
+that h > 0 is the height of the camera above it. RANSAC finds a plane, and weighted least squares refines it: residuals are divided
+by the sensor's noise, which grows with depth (`camera.depth_noise`).
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ import numpy as np
 from neuspring.data.camera import Plane, depth_noise
 
 HYPOTHESES = 2000
-"""Triples of points per search: a plane with a tenth of the points is hit twice."""
+"""Point triples per search: on average two of them are on a plane with a tenth of the points."""
 SCORED_POINTS = 800
-"""Points on which a hypothesis is scored."""
+"""Points that score a hypothesis."""
 CLOUD_POINTS = 20000
-"""Points of all frames together."""
+"""Largest number of points from all frames together."""
 FLATNESS = 0.001
 """m. Deviation of a table from a plane, and of the sensor from its calibration."""
 SIGMAS = 3.0
-"""A point within so many deviations of the noise lies on the plane."""
+"""A point is on the plane if its distance is below this many standard deviations of the noise."""
 BEST = 8
-"""Hypotheses that are refined."""
+"""Number of hypotheses that are refined."""
 REFINEMENTS = 8
-"""Refinements of a plane."""
+"""Iterations of a refinement."""
 PLANES = 4
-"""Planes that are looked for, the largest first."""
+"""Largest number of planes, the largest first."""
 PLANE_SHARE = 0.03
-"""Share of the points below which a plane is none."""
+"""Smallest fraction of the points that makes a plane."""
 
 
 def cloud(depths: Sequence[np.ndarray], intrinsics: np.ndarray, most: int = CLOUD_POINTS) -> np.ndarray:
-    """Points [n, 3], m, in the coordinates of the camera, of depth images [H, W], m, 0: none; every k-th pixel of each."""
+    """Points [n, 3], m, in camera coordinates, from every k-th pixel of depth images [H, W], m (0: no depth)."""
     clouds = []
     for depth in depths:
         y, x = np.nonzero(depth > 0)
@@ -48,14 +48,14 @@ def cloud(depths: Sequence[np.ndarray], intrinsics: np.ndarray, most: int = CLOU
 def noise(points: np.ndarray, height: float | np.ndarray) -> np.ndarray:
     """Standard deviation [n], m, of the distance of points [n, 3] from a plane `height` below the camera.
 
-    Depth is measured along the ray, which meets the plane at an angle: the part of its noise across the plane is height / z.
+    Depth is measured along the ray, which meets the plane at an angle: the fraction height / z of its noise is normal to the plane.
     """
     depth = points[:, 2]
     return np.asarray(np.hypot(depth_noise(depth) * np.abs(height) / depth, FLATNESS))
 
 
 def planes(points: np.ndarray, most: int = PLANES) -> list[Plane]:
-    """The planes in points [n, 3], m, the largest first: each is searched among the points that those before it left."""
+    """The planes in points [n, 3], m, the largest first. Each search uses the points that are on no earlier plane."""
     left, found = points, list[Plane]()
     while len(found) < most and len(left) >= max(PLANE_SHARE * len(points), 50):
         plane = _largest(left, len(points))
@@ -67,7 +67,7 @@ def planes(points: np.ndarray, most: int = PLANES) -> list[Plane]:
 
 
 def refined(points: np.ndarray, normal: np.ndarray, height: float, total: int | None = None) -> Plane | None:
-    """The plane near the given one that fits points [n, 3] best by weighted least squares, or None where too few lie near it."""
+    """The plane near the given one that fits points [n, 3] best by weighted least squares; None if fewer than 20 are near it."""
     scale = 2.0
     near = np.zeros(len(points), dtype=bool)
     for _ in range(REFINEMENTS):
@@ -83,7 +83,7 @@ def refined(points: np.ndarray, normal: np.ndarray, height: float, total: int | 
         height = float(-normal @ center)
         if height < 0:
             normal, height = -normal, -height
-        # A sensor with more or less noise than the model has other deviations: the scale follows the median of what is near.
+        # Sensors have more or less noise than the model: the scale follows the median residual.
         distance = np.abs(points[near] @ normal + height) / sigma[near]
         scale = float(np.clip(1.4826 * np.median(distance), 0.5, 2.0))
     rms = float(np.sqrt(np.mean((points[near] @ normal + height) ** 2)))
@@ -91,13 +91,13 @@ def refined(points: np.ndarray, normal: np.ndarray, height: float, total: int | 
 
 
 def _largest(points: np.ndarray, total: int) -> Plane | None:
-    """The plane with the most of `points`; deterministic."""
+    """The plane that contains the most of `points`; deterministic."""
     rng = np.random.default_rng(0)
     corners = points[rng.integers(len(points), size=(HYPOTHESES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
-    whole = length > 1e-9
-    normals, corners = normals[whole] / length[whole, None], corners[whole]
+    valid = length > 1e-9
+    normals, corners = normals[valid] / length[valid, None], corners[valid]
     if not len(normals):
         return None
     heights = -np.einsum("ij,ij->i", normals, corners[:, 0])

@@ -1,4 +1,4 @@
-"""Results that the steps of perception hand on: one file each, with the backend that made it and its quality numbers."""
+"""Results that the steps of perception pass on: one file each, with its backend and its quality measures."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ class Masks(_Result):
     """The pixels of one camera that show the object and the hands."""
 
     kind: ClassVar[str] = "masks"
-    labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands, 3 person; 0 in frames that the camera missed")
+    labels: np.ndarray = array("T,H,W", np.uint8, "1", "0 nothing, 1 object, 2 hands, 3 person; 0 in missing frames")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PixelTracks(_Result):
-    """Points followed through one camera's video, all starting in frame 0."""
+    """Points tracked through one camera's video; all tracks start in frame 0."""
 
     kind: ClassVar[str] = "pixel_tracks"
-    pixels: np.ndarray = array("T,Q,2", np.float32, "px", "x, y; where a point is not visible its last place")
+    pixels: np.ndarray = array("T,Q,2", np.float32, "px", "x, y; the last position while a point is not visible")
     visible: np.ndarray = array("T,Q", np.bool_, "1", "whether the tracker sees the point")
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiftedTracks(_Result):
-    """Tracks of all cameras in the world, filtered; object tracks are visible in frame 0, controllers in every frame."""
+    """Filtered tracks of all cameras in the world; object tracks are visible in frame 0, controllers in every frame."""
 
     kind: ClassVar[str] = "lifted_tracks"
     object_points: np.ndarray = array("T,No,3", np.float32, "m", "zeros where invisible")
@@ -49,10 +49,10 @@ class LiftedTracks(_Result):
     object_colors: np.ndarray = array("No,3", np.float32, "1", "RGB in frame 0")
     controller_points: np.ndarray = array("T,C,3", np.float32, "m", "chosen points of the hands")
     controller_valid: np.ndarray = array(
-        "T,C", np.bool_, "1", "whether each controller holds in each frame; empty: all do in all frames", omitted=True
+        "T,C", np.bool_, "1", "whether each controller holds in each frame; empty: all always hold", omitted=True
     )
     cloud: np.ndarray = array("P,3", np.float32, "m", "all object points of frame 0")
-    cloud_colors: np.ndarray = array("P,3", np.float32, "1", "their RGB")
+    cloud_colors: np.ndarray = array("P,3", np.float32, "1", "RGB of the cloud")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +63,12 @@ class ShapePrior(_Result):
     vertices: np.ndarray = array("V,3", np.float32, "m", "world")
     faces: np.ndarray = array("F,3", np.int32, "1", "outward")
     seen: np.ndarray = array(
-        "W", np.bool_, "1", "whether some camera saw each vertex; the rest is invented; empty: unknown", optional=True
+        "W", np.bool_, "1", "vertices that a camera saw; all others are inferred; empty: unknown", optional=True
     )
 
 
 def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Masks]:
-    """Masks by camera, from records in the capture's order. Raises InputError for too few and for masks of another size."""
+    """Masks by camera, from records in the capture's order. Raises InputError for a missing record or another size."""
     by_camera = {}
     for name, path in _record_of(capture, records, "--masks").items():
         masks, camera = Masks.load(StageRecord.load(path).file("masks", path)), capture.cameras[name]
@@ -81,7 +81,7 @@ def masks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, Mas
 
 
 def tracks_of_cameras(capture: Capture, records: Sequence[Path]) -> dict[str, PixelTracks]:
-    """Tracks by camera, from records in the capture's order. Raises InputError for too few."""
+    """Tracks by camera, from records in the capture's order. Raises InputError for a missing record."""
     by_camera = _record_of(capture, records, "--tracks")
     return {name: PixelTracks.load(StageRecord.load(path).file("tracks", path)) for name, path in by_camera.items()}
 

@@ -1,11 +1,12 @@
-"""The small twin that travels with the package, in the form in which the workflow leaves a run."""
+"""The sample twin of the package, in the folder layout of a run."""
 
 from pathlib import Path
 
 
 def sample_twin() -> Path:
-    """The folder of a fitted run of the demo's plush sloth: synthetic, 45 frames, with its observations and splats.
+    """Return the folder of a fitted run on the demo's plush sloth: synthetic, 45 frames, with observations and splats.
 
-    It serves whatever takes `results/<scenario>/<method>/<seed>`. `make sample` makes it again; its run.json names the commit.
+    Every command that takes `results/<scenario>/<method>/<seed>` accepts it. `make sample` creates it again; its run.json contains
+    the commit.
     """
     return Path(__file__).with_name("sample_twin") / "synthetic_single_lift_sloth" / "neuspring" / "0"

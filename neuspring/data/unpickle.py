@@ -1,8 +1,8 @@
-"""A restricted unpickler: plain values and numeric NumPy arrays, nothing else.
+"""A restricted unpickler for plain values and numeric NumPy arrays.
 
-A pickle is a program. This one can name the globals of `ALLOWED` alone, and even those are stand-ins, which only note how they are
-called. Their notes become arrays and scalars after the program has ended: no NumPy code sees the file's bytes before we have
-checked dtype, shape and length, because `ndarray.__setstate__` and `dtype.__setstate__` trust their input.
+A pickle is a program. This unpickler accepts only the globals in `ALLOWED`, and replaces them by stand-ins that record how they are
+called. After the program has ended, the records become arrays and scalars. NumPy therefore receives no bytes of the file before
+dtype, shape and length are checked; `ndarray.__setstate__` and `dtype.__setstate__` trust their input.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ MEMO_OPCODES = ("PUT", "BINPUT", "LONG_BINPUT")
 
 
 class _Refused(pickle.UnpicklingError):
-    """The pickle is well formed, but asks for something that we do not do."""
+    """The pickle is well formed, but contains something that is not allowed."""
 
 
 class _StandIn:
-    """A global of the allow-list, or a call of one: its arguments (None: not called), and the state that BUILD gives it.
+    """An allowed global, or a call of it, with its arguments (None: not called) and the state that BUILD assigns.
 
-    Without __dict__, and BUILD cannot write to its slots.
+    It has no __dict__, and BUILD cannot write to its slots.
     """
 
     __slots__ = ("args", "name", "state")
@@ -47,7 +47,7 @@ class _StandIn:
 
     def __call__(self, *args: Any) -> _StandIn:
         if self.args is not None:
-            raise _Refused(f"a call of what {self.name} returns")
+            raise _Refused(f"a call of the result of {self.name}")
         return _StandIn(self.name, args)
 
     def __setstate__(self, state: Any) -> None:
@@ -64,7 +64,7 @@ class _StandIn:
                 return _array(data, dtype, shape, "C").transpose(axes)
             case "scalar", (dtype, data), None:
                 return _array(data, dtype, (), "C")[()]
-            # Old protocols spell bytes as text; only the encoding that pickle itself uses is accepted.
+            # Old protocols store bytes as text; only pickle's own encoding is accepted.
             case "encode", (str(text), "latin1"), None:
                 return text.encode("latin1")
         with_what = "" if self.args is None else f" with {reprlib.repr(self.args)}"
@@ -122,8 +122,8 @@ class _Unpickler(pickle.Unpickler):
 def load_pickle(path: Path) -> Any:
     """Read a pickle of plain values (numbers, text, lists, tuples, dicts, sets) and numeric NumPy arrays and scalars.
 
-    Arrays come back native-endian and owning their memory. Raises InputError, naming the file and what was refused, for every
-    other content and for files that cannot be read; nothing that the file names is imported or called.
+    Arrays are native-endian and own their memory. Raises InputError with the file and the refused content, also for unreadable
+    files. Nothing that the file names is imported or called.
     """
     path = Path(path)
     try:
@@ -134,11 +134,11 @@ def load_pickle(path: Path) -> Any:
         _scan(data)
         return _finished(_Unpickler(io.BytesIO(data)).load(), {})
     except _Refused as error:
-        rule = "a pickle may hold plain values and numeric NumPy arrays only"
-        raise InputError(path, rule, str(error), "Nothing in it was run; get the file from its original source.") from error
+        rule = "a pickle may contain only plain values and numeric NumPy arrays"
+        raise InputError(path, rule, str(error), "No code of it was run. Get the file from its original source.") from error
     except Exception as error:  # The pickle documentation: damaged data may raise any exception.
-        told = f"{type(error).__name__}: {error}"
-        raise InputError(path, "this file must be a complete pickle", told, "Copy it again.") from error
+        received = f"{type(error).__name__}: {error}"
+        raise InputError(path, "this file must be a complete pickle", received, "Copy it again.") from error
 
 
 def _scan(data: bytes) -> None:
@@ -151,7 +151,7 @@ def _scan(data: bytes) -> None:
 
 
 def _finished(value: Any, done: dict[int, Any]) -> Any:
-    """`value` with stand-ins replaced. `done` maps id -> result, so shared containers stay shared and cost once."""
+    """`value` with stand-ins replaced. `done` maps id -> result: shared containers stay shared and are converted once."""
     if value is None or isinstance(value, (bool, int, float, complex, str, bytes, bytearray)):
         return value
     if id(value) in done:

@@ -1,6 +1,4 @@
-"""Pictures: of runs (`run`, `images`), of numbers (`benchmark`), for papers (`strip`, `twin`, `film`),
-and in a notebook (`show`).
+"""Figures of runs (`run`, `images`), of numbers (`benchmark`), for papers (`strip`, `twin`, `film`) and for notebooks (`show`).
 
-All of them have one style and one layout of panels (`sheet`), one camera model (`scene`), and one painter of panels
-(`painter`, `twin`).
+They share the style and the layout of panels (`sheet`), the camera model (`scene`) and the drawing of panels (`painter`, `twin`).
 """

@@ -1,4 +1,4 @@
-"""Short films for a README: observed beside predicted, as MP4 or as GIF that loops, within a size."""
+"""Short videos for a README: observed and predicted side by side, as MP4 or looping GIF of limited file size."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from neuspring.draw.sheet import BAR, EDGE, TEXT, color_bar, panels, time_bar
 from neuspring.draw.video import Video
 
 DOTS = 110
-"""Dots per inch at full width, so that text is as tall on a screen as on paper."""
+"""Dots per inch at full width; text has the same size on a screen as on paper."""
 HOLD = 0.8
-"""Time for which a GIF shows its last frame before it begins again, s."""
+"""Duration of the last frame of a GIF, s."""
 CENTISECOND, SHORTEST_FRAME = 100, 2
-"""Centiseconds of a second, and of the shortest frame; browsers take a shorter time of a frame for 10."""
+"""Centiseconds per second, and of the shortest frame; browsers replace shorter durations by 10."""
 GIF_COLORS, FILM_QUALITY = 96, 23
-"""Colors of a GIF, and rate factor of an MP4 (`video.Video`)."""
+"""Number of colors of a GIF, and constant rate factor of an MP4 (`video.Video`)."""
 PALETTE_FRAMES = 8
-"""Frames from which the colors of a GIF are chosen."""
+"""Number of frames from which the palette of a GIF is computed."""
 SCALES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25)
-"""Parts of the width that are tried until a film fits."""
+"""Fractions of the width, tried in this order until the file is small enough."""
 
 
 @dataclass(frozen=True)
 class WrittenFilm:
-    """Size and rate of a film that was written."""
+    """Size and frame rate of a written video."""
 
     frames: int
     width: int
@@ -45,38 +45,38 @@ class WrittenFilm:
 
     def __str__(self) -> str:
         text = f"{self.frames} frames of {self.width} x {self.height} pixels, {self.rate:.3g} per second, {self.bytes / 1e6:.3g} MB"
-        return text + (" (coarser than asked for, to fit --megabytes)" if self.coarser else "")
+        return text + (" (coarser than requested, to fit --megabytes)" if self.coarser else "")
 
 
 def write_film(painter: Painter, path: Path, width: int, megabytes: float = 2.0) -> WrittenFilm:
-    """Write the film; if it does not fit, a GIF of every other frame, then fewer pixels until it does.
+    """Write the video within `megabytes`: a GIF first drops every other frame, then the width is reduced (`SCALES`).
 
-    Raises InputError where nothing fits.
+    Raises InputError if the smallest video is too large.
     """
     rate, gif = painter.scene.observations.scenario.frame_rate, path.suffix.lower() == ".gif"
     made = path.with_name(f".{path.name}.try{path.suffix}")
     tries = [(1, 1.0)] * gif + [(1 + gif, scale) for scale in SCALES]
     try:
         for every, scale in tries:
-            pictures = list(film_pictures(painter, painter.frames[::every], max(round(scale * width), 80)))
+            images = list(film_pictures(painter, painter.frames[::every], max(round(scale * width), 80)))
             if gif:
-                write_gif(made, pictures, rate / every)
+                write_gif(made, images, rate / every)
             else:
                 with Video(made, rate, FILM_QUALITY) as video:
-                    for picture in pictures:
-                        video.add(picture)
-            size, (high, wide) = made.stat().st_size, pictures[0].shape[:2]
+                    for image in images:
+                        video.add(image)
+            size, (high, wide) = made.stat().st_size, images[0].shape[:2]
             if size <= 1e6 * megabytes:
                 write_atomically(path, made.replace)
-                return WrittenFilm(len(pictures), wide, high, rate / every, size, (every, scale) != tries[0])
+                return WrittenFilm(len(images), wide, high, rate / every, size, (every, scale) != tries[0])
     finally:
         made.unlink(missing_ok=True)
-    remedy = f"Name fewer --frames or methods{', or write .mp4' * gif}."
-    raise InputError("--megabytes", f"the coarsest film has {size / 1e6:.2g} MB", megabytes, remedy)
+    remedy = f"Reduce --frames or --methods{', or write .mp4' * gif}."
+    raise InputError("--megabytes", f"must be at least {size / 1e6:.2g}, the size of the smallest video", megabytes, remedy)
 
 
 def film_pictures(painter: Painter, frames: Sequence[int], width: int) -> Iterator[np.ndarray]:
-    """Pictures [H, W, 3] uint8, both sides even: observed and the methods side by side, errors below, the bar of time on top."""
+    """Images [H, W, 3] uint8 with even sides: observed and the methods side by side, errors below, the time bar on top."""
     view, scenario, first = painter.scene.view, painter.scene.observations.scenario, int(not painter.manner.together)
     names = ["observed"] * first + [take.label for take in painter.takes]
     inches, errors = max(width / DOTS, 1.5), painter.manner.error != "none"
@@ -106,8 +106,8 @@ def film_pictures(painter: Painter, frames: Sequence[int], width: int) -> Iterat
 
 
 def write_gif(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
-    """A GIF that begins again for ever. Its times are whole hundredths of a second; they add up to those of the film."""
-    # One palette for all frames: colors that change from frame to frame flicker, and pixels that stay need no bytes.
+    """Write an endlessly looping GIF. Frame durations are whole centiseconds and add up to the duration of the video."""
+    # One palette for all frames avoids flicker, and constant pixels need no bytes.
     palette = Image.fromarray(np.vstack(spread(pictures, PALETTE_FRAMES))).quantize(GIF_COLORS, method=Image.Quantize.MAXCOVERAGE)
     frames = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = np.round(CENTISECOND * np.arange(len(frames) + 1) / rate).astype(int)

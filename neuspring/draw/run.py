@@ -1,4 +1,4 @@
-"""Figures of a run: errors over time, losses, predicted against observed points, and the twin."""
+"""Figures of a run: errors over time, losses, predicted and observed points, and the twin."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from neuspring.twin.body import lines_of
 RUN_FIGURES = ("errors.png", "motion.png", "losses.png", "topology.png", "stiffness.png")
 IMAGE_SCORES = "image_scores.png"
 RUN_WIDTH, HISTOGRAM = 10.0, 3.4
-"""Width of figures of motion and twins, and of the histogram, inches."""
+"""Widths of the figures of motion and twins, and of the histogram, inches."""
 FROM_ABOVE = 75.0
 """Elevation of the second view of a twin, degrees."""
 DIVERGED_COST = 1e3
-"""Costs above this are of candidates that could not be simulated."""
+"""Larger costs belong to candidates whose simulation diverged."""
 SERIES = {"best_cost": "best cost so far", "loss": "loss", "rollout_loss": "loss of rollouts"}
-"""Metrics of histories that are drawn, and their labels."""
+"""Drawn metrics of histories and their labels."""
 
 
 def run_figures(
@@ -43,14 +43,17 @@ def run_figures(
     twin: Twin | None = None,
     searched: float | None = None,
 ) -> list[Path]:
-    """Draw the figures of a run, and return the files.
+    """Draw the figures of a run and return the files.
 
-    errors.png and motion.png need a trajectory, losses.png a history, topology.png and stiffness.png the run's last twin.
-    `errors` are those of `metrics.errors_per_frame`, m, computed here if not given. `searched` is the homogeneous stiffness that
-    the search found, N, marked among the twin's.
+    - errors.png, motion.png: require a trajectory
+    - losses.png: requires a history
+    - topology.png, stiffness.png: require the run's last twin
+
+    `errors` is the result of `metrics.errors_per_frame`, m; computed here if not given. `searched` is the homogeneous stiffness
+    of the search, N, drawn in the histogram of stiffness.
     """
     title, scenario, made = f"{observations.scenario.name}, {method}", observations.scenario, dict[str, Figure]()
-    # A picture of an earlier result must not stay beside this one's.
+    # Remove figures of earlier results.
     for name in (*RUN_FIGURES, IMAGE_SCORES):
         (folder / name).unlink(missing_ok=True)
     if trajectory is not None and len(trajectory.positions):
@@ -75,14 +78,14 @@ def _over_time(values: np.ndarray, scenario: Scenario) -> pd.Series:
 
 
 def history_lines(history: pd.DataFrame) -> dict[str, pd.Series]:
-    """Label -> values by step of what a stage's history says of its costs or losses; diverged candidates are left out."""
+    """Label -> costs or losses by step, from a stage's history, without diverged candidates."""
     history = history[history["value"] < DIVERGED_COST]
     parts = {label: history[history["metric"] == metric] for metric, label in SERIES.items()}
     return {label: part.set_index("step")["value"].astype(float) for label, part in parts.items() if len(part)}
 
 
 def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, folder: Path) -> Path:
-    """Draw image_scores.png: every metric of pictures over time, from rows frame, camera, metric, value; returns the file."""
+    """Draw image_scores.png: all image metrics over time, from columns frame, camera, metric, value; returns the file."""
     finite = frames[np.isfinite(frames["value"])]
     panels = {}
     for name, part in finite.groupby("metric", sort=False):
@@ -92,7 +95,7 @@ def image_scores_figure(frames: pd.DataFrame, scenario: Scenario, method: str, f
 
 
 def motion_figure(observations: Observations, trajectory: Trajectory, method: str) -> Figure:
-    """A strip of a few frames: observed points, predicted nodes, and their distances, as `neuspring draw strip --as nodes`."""
+    """A strip of a few frames with observed points, predicted nodes and their distances, as `neuspring draw strip --as nodes`."""
     scenario, take = observations.scenario, ShownRun(method, trajectory.positions)
     frames = sorted({*chosen_frames(scenario, len(take.positions)), *chosen_frames(scenario, scenario.frame_count)})
     scene = ShownScene.from_side(observations, [take], frames)
@@ -100,7 +103,7 @@ def motion_figure(observations: Observations, trajectory: Trajectory, method: st
 
 
 def _from_two_sides(observations: Observations, take: ShownRun, label: str, *quantities: str) -> TwinPicture:
-    """The twin in frame 0 from its broad side, and from above."""
+    """The twin in frame 0 from its broad side and from above."""
     columns = [
         (ShownScene.from_side(observations, [take], [0]), replace(take, label=label)),
         (ShownScene.from_side(observations, [take], [0], elevation=FROM_ABOVE), replace(take, label="from above")),
@@ -109,9 +112,9 @@ def _from_two_sides(observations: Observations, take: ShownRun, label: str, *qua
 
 
 def stiffness_figure(observations: Observations, take: ShownRun, searched: float | None) -> Figure:
-    """The body's lines in frame 0 colored by stiffness in two views, and their histogram with the searched stiffness [N] marked.
+    """Two views of a twin's lines in frame 0, colored by stiffness, and their histogram with the searched stiffness, N.
 
-    The body must have a line.
+    The twin must have at least one line.
     """
     assert take.twin is not None
     lines = lines_of(take.twin)

@@ -1,4 +1,4 @@
-"""Subject of a picture: the scene and its video as one camera sees them, from any side, and predictions."""
+"""Subject of a figure: an observed scene seen by one camera of any position, and predictions."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from neuspring.core.errors import InputError
 from neuspring.data.camera import Camera
 
 VIEW_SIZE = 1200
-"""Pixels of the picture of a camera from any side; only a part of it is shown."""
+"""Image size, px, of a free camera (`seen_from`); only a part of the image is shown."""
 OPENING = math.radians(20)
-"""Its angle of view: a long lens, so that near and far parts have almost one scale."""
+"""Angle of view of a free camera: a long lens, so that near and far parts have almost the same scale."""
 STEEPEST = 89.0
-"""Degrees above or below the horizon; straight down no side of the picture is up."""
+"""Largest elevation, degrees; in a vertical view, the up direction of the image would be undefined."""
 VIEW_ELEVATION = 25.0
-"""Degrees above the horizon of a view that is not asked for."""
+"""Default elevation, degrees above the horizon."""
 VIEW_MARGIN = 0.04
-"""Free space around what is shown, as a fraction of its larger side."""
+"""Margin around the shown points, as a fraction of their larger side."""
 FLATTEST_PANEL, TALLEST_PANEL = 0.35, 1.3
-"""Least and greatest height of a panel, over its width."""
+"""Smallest and largest ratio of a panel's height to its width."""
 
 
 def broad_side(points: np.ndarray, up: Up) -> float:
-    """The azimuth, degrees, that shows the broadest side of points [P, 3], m: it looks along their least horizontal spread."""
+    """Azimuth, degrees, that shows the broadest side of points [P, 3], m: a view along their smallest horizontal extent."""
     flat = np.asarray(points, float)[:, :2]
     x, y = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][-1] if len(flat) > 1 else (0.0, -1.0)
-    # Of both ends of that line the one nearer to the front, the side of negative y, so that views of one scene agree.
+    # Of the two opposite views, use the one from negative y, so that all views of a scene agree.
     x, y = (x, y) if y < 0 else (-x, -y)
     return math.degrees(math.atan2(up_sign(up) * y, x))
 
 
 def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> Camera:
-    """A camera named "view" that holds all points [P, 3], m.
+    """A camera named "view" whose image contains all points [P, 3], m.
 
-    It stands at `azimuth` degrees around the vertical axis, counted from +x and counter-clockwise as seen from above, and at
-    `elevation` degrees above the horizon. Raises InputError for angles that no camera can have.
+    Its position has the `azimuth`, degrees around the vertical axis, counter-clockwise from +x as seen from above, and the
+    `elevation`, degrees above the horizon. Raises InputError for impossible angles.
     """
     if not math.isfinite(azimuth):
         raise InputError("--azimuth", "must be an angle in degrees", azimuth)
@@ -55,7 +55,7 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(forward, right), forward], axis=1)
     local = (points - middle) @ axes
-    # A point is inside where its offset to the side is at most its depth times the tangent of half the angle of view.
+    # A point is visible if its lateral offset is at most its depth times the tangent of half the angle of view.
     slope = math.tan(OPENING / 2)
     away = float((np.abs(local[:, :2]).max(axis=1) / slope - local[:, 2]).max())
     pose = np.eye(4)
@@ -66,22 +66,22 @@ def seen_from(points: np.ndarray, up: Up, azimuth: float, elevation: float) -> C
 
 
 def box_around(pixels: np.ndarray, camera: Camera, *, clip: bool) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom (behind the last) pixel of the part of a picture that shows pixels [P, 2], with a margin.
+    """Box (left, top, right, bottom; exclusive end) around pixels [P, 2] with a margin.
 
-    A part that is too flat or too tall grows. `clip` keeps it inside of the picture, which a camera's photo has to fill.
+    The box is enlarged to the aspect ratios FLATTEST_PANEL to TALLEST_PANEL. `clip` restricts it to the image, as photos require.
     """
-    low, high, whole = pixels.min(axis=0), pixels.max(axis=0), (camera.width, camera.height)
+    low, high, full = pixels.min(axis=0), pixels.max(axis=0), (camera.width, camera.height)
     size = np.maximum(high - low, 1.0)
     size = size + 2 * VIEW_MARGIN * size.max()
     size[1] = max(size[1], FLATTEST_PANEL * size[0])
     size[0] = max(size[0], size[1] / TALLEST_PANEL)
     ends = np.floor(0.5 * (low + high - size)), np.ceil(0.5 * (low + high + size))
-    (left, top), (right, bottom) = (np.clip(end, 0, whole) if clip else end for end in ends)
+    (left, top), (right, bottom) = (np.clip(end, 0, full) if clip else end for end in ends)
     return int(left), int(top), int(right), int(bottom)
 
 
 def part(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
-    """The camera of a part of its picture."""
+    """The camera whose image is this box of a camera's image."""
     left, top, right, bottom = box
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2, 2] -= left, top
@@ -90,17 +90,17 @@ def part(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
 
 @dataclass(frozen=True, eq=False)
 class ShownRun:
-    """A run's prediction: F frames, N nodes."""
+    """The prediction of a run: F frames, N nodes."""
 
     label: str
     positions: np.ndarray
-    """Nodes [F, N, 3], m; fewer frames than the scenario where it diverged."""
+    """Nodes [F, N, 3], m; fewer frames than the scenario if the rollout diverged."""
     twin: Twin | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ShownScene:
-    """The observed scene, seen by one camera; `box` is the part of its picture that is shown."""
+    """The observed scene, seen by one camera; `box` is the shown part of its image."""
 
     observations: Observations
     camera: Camera
@@ -115,43 +115,43 @@ class ShownScene:
         azimuth: float | None = None,
         elevation: float = VIEW_ELEVATION,
     ) -> Self:
-        """The content of these frames from any side, degrees (`seen_from`); without an azimuth from the broad side."""
+        """The scene from any side (`seen_from`, degrees) with all content of these frames; default azimuth: `broad_side`."""
         points, up = shown_points(observations, takes, frames), observations.scenario.up
         camera = seen_from(points, up, broad_side(points, up) if azimuth is None else azimuth, elevation)
         return cls(observations, camera, box_around(camera.project(points)[0], camera, clip=False))
 
     @cached_property
     def view(self) -> Camera:
-        """The camera of the shown part."""
+        """The camera of the shown part of the image."""
         return part(self.camera, self.box)
 
     def hands(self, frame: int) -> np.ndarray:
-        """Controllers [C, 3], m, that hold the object."""
+        """Controllers [C, 3], m, that hold the object in a frame."""
         valid = self.observations.controller_valid
         points = self.observations.controller_points[frame]
         return np.asarray(points[valid[frame]] if valid.size else points)
 
 
 def shown_points(observations: Observations, takes: Sequence[ShownRun], frames: Sequence[int]) -> np.ndarray:
-    """Points [P, 3], m, that pictures of these frames must show: all observed ones, and predicted ones near them."""
+    """Points [P, 3], m, that figures of these frames must show: all observed points, and predicted points near them."""
     rows = list(frames)
     seen = [observations.object_points[frame][observations.object_visibility[frame]] for frame in rows]
-    real = np.concatenate([*seen, observations.controller_points[rows].reshape(-1, 3)]).astype(float)
+    observed = np.concatenate([*seen, observations.controller_points[rows].reshape(-1, 3)]).astype(float)
     if 0 in rows:
-        real = np.concatenate([real, observations.nodes])
-    # A prediction far away (before it diverges) must not shrink everything else to a dot.
-    low, high = real.min(axis=0), real.max(axis=0)
+        observed = np.concatenate([observed, observations.nodes])
+    # A diverging prediction must not shrink the scene to a dot.
+    low, high = observed.min(axis=0), observed.max(axis=0)
     reach = 0.25 * float((high - low).max())
     near = [
         np.clip(take.positions[frame], low - reach, high + reach) for take in takes for frame in rows if frame < len(take.positions)
     ]
-    return np.concatenate([real, *near])
+    return np.concatenate([observed, *near])
 
 
 def chosen_frames(scenario: Scenario, frames: int) -> dict[int, str]:
-    """Frames to show, in order, and their names. The trajectory has `frames` frames; it diverged if the scenario has more."""
+    """Frames to show, in order, with their names. The trajectory has `frames` frames; fewer than the scenario if it diverged."""
     last = scenario.frame_count - 1
-    # Where two fall together the later entry names the frame.
+    # If two entries are the same frame, the later entry names it.
     named = {
         (scenario.train_end + last) // 2: "middle of the future",
         last: "last frame",

@@ -1,4 +1,4 @@
-"""The style and the layout of all pictures: sizes, colors, the grid of panels, color bars, and how files are written."""
+"""Style and layout of all figures: sizes, colors, the grid of panels, color bars, and writing of files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-# A notebook's own backend stays: it shows the user's figures.
+# Keep the backend of notebooks, which shows the user's figures.
 if "inline" not in str(matplotlib.get_backend(auto_select=False)):
     matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -20,33 +20,34 @@ from matplotlib.figure import Figure
 from neuspring.core.files import write_atomically
 
 TEXT = 8.0
-"""Size of text, points, at the width that the picture is made for."""
+"""Size of text, points, at the intended width of a figure."""
 DPI = 110
-"""Dots per inch of pictures of runs and benchmarks."""
+"""Dots per inch of figures of runs and benchmarks."""
 JPEG = 90
 TRAINING, FUTURE = (110, 160, 240), (240, 150, 50)
-"""Colors of the two parts of the time."""
+"""RGB of training and future frames."""
 WORST = 0.5
-"""Color difference, of 1, at the end of error pictures."""
+"""Color difference at the upper end of error images; colors are 0 to 1."""
 EDGE, PANEL_GAP, HEAD, BAR = 0.03, 0.04, 0.2, 0.62
-"""Margins at the sides, between panels, above them for names, and for a color bar, inches."""
+"""Margins in inches: at the sides, between panels, above panels for titles, and for a color bar."""
 PICTURE_WIDTH = 3.2
-"""Width of a picture of a contact sheet, inches."""
+"""Width of an image of a sheet (`picture_sheet`), inches."""
 TIME_BAR = 6
-"""Height of the bar that shows the time in a run's film, px."""
+"""Height of the time bar of a video, px."""
 TITLE_LINE = 20
-"""Height of the line of names above its panels, px."""
+"""Height of the line of titles above the panels of a video, px."""
 CONTROLLER = "tab:red"
 MOST_SPRINGS = 20_000
-"""More springs than this are not drawn: lines would cover each other."""
+"""Largest number of drawn springs; more lines would cover each other."""
 
 
 def panels(
     width: float, shapes: Sequence[float], rows: int, *, left: float = EDGE, right: float = EDGE, head: float = HEAD
 ) -> tuple[Figure, np.ndarray]:
-    """A figure `width` inches wide and its axes [rows, columns]: the layout of strips, films, twins and contact sheets.
+    """A figure `width` inches wide and its axes [rows, columns]: the layout of strips, videos, twins and sheets.
 
-    All panels have one height; `shapes` are the columns' widths over it. Margins `left`, `right` and `head` are inches.
+    All panels have the same height; `shapes` are the ratios of the columns' widths to it. `left`, `right` and `head` are margins,
+    inches.
     """
     high = (width - left - right - PANEL_GAP * (len(shapes) - 1)) / sum(shapes)
     total = head + rows * (high + PANEL_GAP)
@@ -57,7 +58,7 @@ def panels(
 
 
 def picture_sheet(rows: Sequence[Sequence[tuple[str, np.ndarray]]], path: Path) -> Path:
-    """Write rows of titled pictures [H, W, 3] of one shape."""
+    """Write rows of titled images [H, W, 3] of the same shape; returns the file."""
     high, wide = rows[0][0][1].shape[:2]
     figure, axes = panels(PICTURE_WIDTH * len(rows[0]), [wide / (high + 0.1 * wide)] * len(rows[0]), len(rows), head=0)
     for axis, (title, picture) in zip(axes.flat, [pair for row in rows for pair in row], strict=True):
@@ -69,7 +70,7 @@ def picture_sheet(rows: Sequence[Sequence[tuple[str, np.ndarray]]], path: Path) 
 
 
 def time_bar(frame: int, frames: int, train_end: int, width: int) -> np.ndarray:
-    """A bar [TIME_BAR, width, 3] uint8 filled up to a frame: training and future in their colors, their border in white."""
+    """A bar [TIME_BAR, width, 3] uint8, filled up to a frame in the colors of training and future; a white line separates them."""
     bar = np.zeros((TIME_BAR, width, 3), np.uint8)
     border, now = (round(width * k / frames) for k in (train_end, frame + 1))
     for start, stop, shade in ((0, border, TRAINING), (border, width, FUTURE)):
@@ -80,24 +81,24 @@ def time_bar(frame: int, frames: int, train_end: int, width: int) -> np.ndarray:
 
 
 def false_colors(difference: np.ndarray) -> np.ndarray:
-    """Color differences [H, W] of 0 to WORST as a picture [H, W, 3] uint8."""
+    """Color differences [H, W] from 0 to WORST as a false-color image [H, W, 3] uint8."""
     return (255 * matplotlib.colormaps["inferno"](np.clip(difference / WORST, 0, 1))[..., :3]).astype(np.uint8)
 
 
 def dark(color: Sequence[int]) -> tuple[float, ...]:
-    """A color of 0 to 255 for text on white."""
+    """Darken an RGB color (0 to 255) for text on white; returns 0 to 1."""
     return tuple(0.75 * value / 255 for value in color)
 
 
 def points_across(axis: Axes) -> float:
-    """Width of a panel, points."""
+    """The width of a panel, points."""
     figure = axis.get_figure(root=True)
     assert figure is not None
     return 72 * figure.get_figwidth() * axis.get_position().width
 
 
 def color_bar(axes: Iterable[Axes], norm: Normalize, colors: str, label: str, extend: str = "max") -> None:
-    """A color bar at the right of panels that stand below each other."""
+    """Draw a color bar to the right of a column of panels."""
     axes = list(axes)
     figure, low, high = axes[0].get_figure(root=True), axes[-1].get_position(), axes[0].get_position()
     assert figure is not None
@@ -111,16 +112,16 @@ def color_bar(axes: Iterable[Axes], norm: Normalize, colors: str, label: str, ex
 
 
 def sample(count: int, most: int = MOST_SPRINGS) -> np.ndarray:
-    """Indices, ascending, of the springs or splats to draw: all of them, or a random `most` that is the same every time."""
+    """Ascending indices of the springs or splats to draw: all, or a random but reproducible selection of `most`."""
     if count <= most:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
 def save(figure: Figure, path: Path, dpi: float = DPI) -> Path:
-    """Write a figure as its ending says, atomically and the same each time, and close it; PDF with TrueType text."""
+    """Write a figure in the format of the extension, atomically and reproducibly, and close it; PDF with TrueType fonts."""
     kind = path.suffix.lower().removeprefix(".")
-    # A date would make two equal pictures differ.
+    # With a date, the files of equal figures would differ.
     facts = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
     more = {"pil_kwargs": {"quality": JPEG}} if kind == "jpg" else {"metadata": facts} if facts else {}
     try:

@@ -1,4 +1,4 @@
-"""A twin, a prediction or a run as one picture or film: in a cell of a notebook, or in a file."""
+"""A twin, a prediction or a run as one figure or video, in a notebook cell or a file."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from neuspring.draw.strip import strip_figure
 
 PICTURE_KINDS, FILM_KINDS = (".png", ".jpg", ".svg", ".pdf"), (".gif", ".mp4")
 PANELS = 5
-"""Frames of a picture of nodes alone."""
+"""Number of frames in a figure of nodes without observations."""
 CELL_PIXELS, CELL_RATE, CELL_MEGABYTES = 480, 15.0, 4.0
-"""Width of each panel of a film, pictures per second at most, and its size at most."""
+"""Width of each panel of a video, px; largest frame rate, fps; largest file, MB."""
 ALONE_RATE = 30.0
-"""Frames per second of a trajectory that is shown without observations."""
+"""Frame rate, fps, of a trajectory without observations."""
 
 
 @dataclass(frozen=True)
 class InlinePicture:
-    """A picture or a film; as the last value of a notebook's cell it is shown there."""
+    """A figure or video; a notebook displays it as the last value of a cell."""
 
     data: bytes = field(repr=False)
-    """The content of its file."""
+    """Content of the file."""
     mime: str
-    """For example image/png."""
+    """MIME type, for example image/png."""
 
     def _repr_html_(self) -> str:
         source = f"data:{self.mime};base64,{base64.b64encode(self.data).decode()}"
@@ -48,7 +48,7 @@ class InlinePicture:
 
 
 def show(what: RunFolder | Twin | Trajectory, observations: Observations | None, output: Path | None, film: bool) -> InlinePicture:
-    """`neuspring.api.show`."""
+    """Implementation of `neuspring.api.show`."""
     if isinstance(what, RunFolder):
         observations = what.observations if observations is None else observations
         subject = what.twin if what.trajectory is None else what.trajectory
@@ -65,7 +65,7 @@ def show(what: RunFolder | Twin | Trajectory, observations: Observations | None,
         if path.suffix.lower() not in FILM_KINDS:
             save(_figure(subject, observations), path)
         elif isinstance(subject, Twin):
-            raise InputError(path, "a film is of a trajectory", "a twin", "Roll it out, or name a picture (.png).")
+            raise InputError(path, "a video needs a trajectory", "a twin", "Roll it out, or write a figure (.png).")
         else:
             painter = _painter(subject, observations)
             panels = len(painter.takes) + (not painter.manner.together)
@@ -85,19 +85,23 @@ def _figure(subject: Twin | Trajectory, observations: Observations | None) -> Fi
 
 
 def _painter(trajectory: Trajectory, observations: Observations | None, frames: Sequence[int] | None = None) -> Painter:
-    """Paints the nodes beside what was seen; alone where that is not given."""
+    """A painter of predicted nodes with the observations, or without them."""
     positions, alone = trajectory.positions, observations is None
     seen = _alone(positions) if observations is None else observations
     if len(positions) > len(seen.controller_points):
-        rule = f"the observations have {len(seen.controller_points)} frames"
-        raise InputError("observations", rule, len(positions), "Show a trajectory under other hands without them.")
+        raise InputError(
+            "observations",
+            f"must have at least the {len(positions)} frames of the trajectory",
+            len(seen.controller_points),
+            "Leave them out for other controllers.",
+        )
     take = ShownRun("predicted", positions)
     frames = range(0, len(positions), max(round(seen.scenario.frame_rate / CELL_RATE), 1)) if frames is None else frames
     return Painter(ShownScene.from_side(seen, [take], frames), [take], frames, DrawingStyle(error="none", together=alone))
 
 
 def _alone(positions: np.ndarray, up: Up = "+z", hands: np.ndarray | None = None) -> Observations:
-    """Nodes [F, N, 3], m, as if they had been seen, for pictures of a scene; without `hands` [C, 3], m, none hold them."""
+    """Observations for figures: nodes [F, N, 3], m, as tracked points; `hands` [C, 3], m, if given, as constant controllers."""
     frames, none = max(len(positions), 2), np.zeros((0, 3))
     points = np.concatenate([positions, np.repeat(positions[-1:], frames - len(positions), axis=0)])
     held = points[:, :1] if hands is None else np.repeat(hands[None], frames, axis=0)

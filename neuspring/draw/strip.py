@@ -1,4 +1,4 @@
-"""Strips: the observed frames on top, below them each method's prediction and its error; one column per frame."""
+"""Strips: observed frames in the first row, then each method's prediction and error; one column per frame."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from neuspring.draw.painter import ERROR_COLORS, Painter
 from neuspring.draw.sheet import BAR, EDGE, FUTURE, TEXT, TRAINING, color_bar, dark, panels
 
 LABEL, LETTER = 0.22, 0.6
-"""Room for the names of rows, inches; width of a letter, of its size."""
+"""Margin for row labels, inches, and width of a letter as a fraction of its size."""
 
 
 def rows_of(painter: Painter) -> list[tuple[str, int | None, bool]]:
-    """Label, run and True for its error: the observed frames (no run), then two rows per method, or one without errors."""
+    """(label, index of the run or None, is error) of each row: observed frames, then prediction and, if drawn, error per method."""
     kinds = (False, True) if painter.manner.error != "none" else (False,)
     methods = [(painter.error_name if error else take.label, k, error) for k, take in enumerate(painter.takes) for error in kinds]
     return [*[("observed", None, False)] * (not painter.manner.together), *methods]
 
 
 def strip_figure(painter: Painter, width: float) -> Figure:
-    """The strip, `width` inches wide; frames are named above it, in the colors of training and future."""
+    """Draw the strip, `width` inches wide; the titles of frames have the colors of training and future."""
     rows, view, scenario = rows_of(painter), painter.scene.view, painter.scene.observations.scenario
     errors = painter.manner.error != "none"
     shapes = [view.width / view.height] * len(painter.frames)

@@ -1,4 +1,4 @@
-"""Twins as bodies: springs or surface colored by stiffness, nodes by region, seen by any camera; and a histogram of stiffness."""
+"""Figures of twins: springs or surface colored by stiffness, nodes colored by region, and a histogram of stiffness."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Quantity = Literal["stiffness", "region"]
 STIFFNESS_COLORS = "viridis"
 PALETTE = [f"tab:{name}" for name in ("blue", "orange", "green", "purple", "brown", "pink", "olive", "cyan")] + ["navy", "gold"]
 CROSSING = (0.35, 0.35, 0.35, 1.0)
-"""Springs between regions."""
+"""RGBA of springs between regions."""
 LEGEND_ROOM = 0.75
-"""Room for a color bar or names of regions, inches."""
+"""Margin for a color bar or the legend of regions, inches."""
 MOST_VECTORS = 2500
-"""More lines than this are stored as pixels: a page would open slowly."""
+"""More lines are rasterized, because a page with so many vectors opens slowly."""
 LEAST_RATIO, DEEPEST = 2.0, 1e4
 """Smallest ratio of the ends of a stiffness axis, so that tiny differences do not fill it; largest ratio of a color range."""
 STIFFNESS_BINS = 41
-"""Odd, so that equal values sit in the middle of a bar, under the mark of the searched one."""
+"""Odd, so that equal values are in the middle of a bar, at the line of the searched stiffness."""
 
 
 def region_colors(count: int) -> np.ndarray:
-    """One color [count, 4] per region, RGBA, different from those of controllers and springs."""
+    """One RGBA color per region [count, 4], different from the colors of controllers and springs."""
     if count <= len(PALETTE):
         return to_rgba_array(PALETTE[:count])
     return colormaps["turbo"](np.linspace(0.05, 0.85, count))
@@ -46,7 +46,7 @@ def region_colors(count: int) -> np.ndarray:
 def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
     """Ends of a logarithmic color range, N, for stiffness [S], N.
 
-    All but the outermost 0.5 % on either side; at least a factor of 2 and at most one of 10^4 apart; positive whatever comes in.
+    The range excludes 0.5 % of the values at each end. Its ratio is at least 2 and at most 10^4; both ends are positive.
     """
     if not len(positive := stiffness[stiffness > 0]):
         return 1.0, LEAST_RATIO
@@ -55,7 +55,7 @@ def stiffness_limits(stiffness: np.ndarray) -> tuple[float, float]:
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:
-    """The same range; a range narrower than a factor of 2 is widened to that about its geometric mean."""
+    """Widen a range to a ratio of at least 2 around its geometric mean."""
     if high >= LEAST_RATIO * low:
         return low, high
     middle = float(np.sqrt(low * high))
@@ -64,24 +64,24 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TwinPicture:
-    """Twins in one frame, and what their colors say: a column for each of `takes`, seen in the scene beside it."""
+    """Twins in one frame: one column per (scene, run), one row per quantity that the colors show."""
 
     columns: Sequence[tuple[ShownScene, ShownRun]]
     frame: int
     quantities: Sequence[Quantity]
     limits: tuple[float, float] | None = None
-    """Range of stiffness, N; None: that of the twins."""
+    """Color range of stiffness, N; None: from the twins."""
 
     @cached_property
     def norm(self) -> LogNorm:
-        """The range of stiffness, N, that all twins share."""
+        """The color range of stiffness, N, shared by all twins."""
         if self.limits:
             return LogNorm(*self.limits)
         twins = [_twin(take) for _, take in self.columns]
         return LogNorm(*stiffness_limits(np.concatenate([lines.stiffness[: lines.inner] for lines in map(lines_of, twins)])))
 
     def node_colors(self, take: ShownRun, quantity: Quantity) -> np.ndarray:
-        """RGBA [N, 4]."""
+        """RGBA of nodes [N, 4]."""
         twin = _twin(take)
         if quantity == "stiffness":
             return self._of_stiffness(body_of(twin).node_stiffness(twin))
@@ -89,7 +89,7 @@ class TwinPicture:
         return region_colors(len(names))[region]
 
     def spring_colors(self, take: ShownRun, quantity: Quantity) -> np.ndarray:
-        """RGBA [S, 4] of object springs."""
+        """RGBA of object springs [S, 4]."""
         lines = lines_of(_twin(take))
         if quantity == "stiffness":
             return self._of_stiffness(lines.stiffness[: lines.inner])
@@ -99,17 +99,17 @@ class TwinPicture:
         return np.asarray(colors)
 
     def _of_stiffness(self, values: np.ndarray) -> np.ndarray:
-        # A stiffness of 0 has no color on a log scale; it takes that of the lower end.
+        # A stiffness of 0 gets the color of the lower end of the log scale.
         return np.asarray(colormaps[STIFFNESS_COLORS](self.norm(np.clip(values, self.norm.vmin, self.norm.vmax))))
 
     def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
-        """One panel."""
+        """Draw one panel."""
         empty(axis, scene.view, framed=False)
         self._lines(axis, scene, take, quantity)
         hands(axis, scene, self.frame)
 
     def _lines(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
-        """Springs and nodes, the farthest first, so that the nearest are on top; by region also the springs of hands in frame 0."""
+        """Draw springs and, by region, nodes and the springs of controllers in frame 0; the nearest are on top."""
         lines, nodes = lines_of(_twin(take)), take.positions[self.frame].astype(float)
         seen = scene.observations.controller_points
         everything = lines.points(nodes, seen[min(self.frame, len(seen) - 1)].astype(float))
@@ -136,9 +136,9 @@ class TwinPicture:
 
 
 def twin_figure(body: TwinPicture, width: float, room: float = LEGEND_ROOM) -> Figure:
-    """The picture, `width` inches wide: columns from left to right, quantities from top to bottom, each with its legend.
+    """Draw twins, `width` inches wide: one column per twin, one row per quantity with its legend.
 
-    `room` is kept on the right, inches.
+    `room` is the right margin, inches.
     """
     shapes = [scene.view.width / scene.view.height for scene, _ in body.columns]
     figure, axes = panels(width, shapes, len(body.quantities), right=room)
@@ -155,7 +155,7 @@ def twin_figure(body: TwinPicture, width: float, room: float = LEGEND_ROOM) -> F
 
 
 def _regions(axis: Axes, body: TwinPicture) -> None:
-    """Names of the regions; twins of one scene are divided alike, and the one with most regions names them all."""
+    """Draw the legend of regions, for the twin with the most regions."""
     count = max(len(np.unique(_twin(take).topology.labels)) for _, take in body.columns)
     names = [f"region {k}" for k in range(count)] if count > 1 else ["one region"]
     dots = [Line2D([], [], ls="", marker="o", ms=4, color=color) for color in region_colors(count)]
@@ -167,15 +167,15 @@ def _regions(axis: Axes, body: TwinPicture) -> None:
 
 
 def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float | None) -> None:
-    """Springs over log stiffness [S], N, in the colors of the body; the searched stiffness, N, is marked.
+    """Draw the histogram of stiffness [S], N, on a log axis, in the colors of the twin; the dashed line is `searched`, N.
 
-    Values below the largest / 10^6 are counted there, so that none is left out.
+    Values below the largest / 10^6 are counted at that value.
     """
     shown = np.maximum(stiffness, (stiffness.max() or 1.0) / 1e6)
     low, high = _widened(float(shown.min()), float(shown.max()))
-    # Rounding must not push the extremes out of the outer bins.
-    found: Any = axis.hist(shown, np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1).tolist())
-    _, edges, bars = found
+    # The margins keep rounded extremes inside of the outer bins.
+    drawn: Any = axis.hist(shown, np.geomspace(low * (1 - 1e-6), high * (1 + 1e-6), STIFFNESS_BINS + 1).tolist())
+    _, edges, bars = drawn
     colors = colormaps[STIFFNESS_COLORS](norm(np.clip(np.sqrt(edges[1:] * edges[:-1]), norm.vmin, norm.vmax)))
     for bar, color in zip(bars, colors, strict=True):
         bar.set_facecolor(color)
@@ -189,7 +189,7 @@ def histogram(axis: Axes, stiffness: np.ndarray, norm: LogNorm, searched: float 
 
 
 def _between(lines: Lines) -> np.ndarray:
-    """True [S] where a line of the body joins two regions."""
+    """[S] bool: True if an inner line connects two regions."""
     ends = lines.labels[lines.pairs[: lines.inner]]
     return np.asarray(ends[:, 0] != ends[:, 1])
 

@@ -1,5 +1,6 @@
-"""From data of cameras, motion capture and others to observations, and findings about them.
+"""Read points in space and PhysTwin's data as observations or captures, and check any data folder.
 
-- `points`: hands, nodes and points in space. `phystwin`: processed cases. `phystwin_raw`: PhysTwin's raw layout.
-- `depth`: planes in depth. `check`: findings about a folder of data.
+- `points`: controllers, nodes and annotated points in space.
+- `phystwin`: processed cases. `phystwin_raw`: PhysTwin's raw layout.
+- `check`: findings about a folder of data.
 """

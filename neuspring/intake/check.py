@@ -1,7 +1,7 @@
-"""Findings about a data set: a capture, a processed case of PhysTwin, C3D files, and the layouts of packages.
+"""Findings about a data set: captures, cases of PhysTwin, C3D files, and layouts of other packages.
 
-Nothing here raises for bad content: an error makes a twin wrong or impossible, a warning is unusual and says the next step;
-`neuspring.checks.table` lists what is measured.
+Bad content never raises an exception. An error makes a twin wrong or impossible; a warning is unusual and states the next step.
+`neuspring.checks.table` lists all checks.
 """
 
 from __future__ import annotations
@@ -34,41 +34,42 @@ from neuspring.intake.points import InSpace, look
 from neuspring.registry import Registry
 
 LEAST_AROUND = 0.1
-"""Share of the image that must have depth, beside object and hands, before the table is looked for."""
+"""Fraction of the image that must have depth outside object and hands before the table is searched."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A further kind of data that check-data checks."""
+    """Another kind of data that check-data accepts."""
 
     recognizes: Callable[[Path], bool]
     """True for a file or folder of this kind."""
     check: Callable[[Path, Config], list[Finding]]
-    """All findings about it; nothing is raised for bad content."""
+    """All findings about it; bad content must not raise."""
 
 
 LAYOUTS: Registry[Layout] = Registry("layouts", {}, Layout)
-"""Kinds of data of packages: entry points of the group `neuspring.layouts`."""
+"""Layouts of other packages: entry points of the group `neuspring.layouts`."""
 
 
 def check_layout(folder: Path, config: Config | None = None) -> list[Finding]:
-    """Check a capture or a folder of them, a processed or raw case, a folder of cases, a root with data/different_types, C3D files
-    (or one, with labels or without), or data of a package. Returns every finding.
+    """Check a file or folder of data and return every finding.
 
-    Raises InputError only if `folder` does not exist or holds no data of a known layout.
+    Accepts a capture or a folder of captures, a processed or raw case, a folder of cases, a root with data/different_types, C3D
+    files (one file may have labels: FILE.c3d#LABEL), and layouts of other packages. Raises InputError only if `folder` does not
+    exist or contains no data of a known layout.
     """
     folder = Path(folder)
     if is_c3d(folder) and plain_file(folder).is_file():
         return check_markers(folder)
     if not folder.exists():
-        raise InputError(folder, "a folder or file to check is required", "nothing there")
+        raise InputError(folder, "a folder or file to check is required", "no such path")
     if folder.is_dir():
         if captures := _captures(folder):
             return [finding for path in captures for finding in check_capture(path)]
         if cases := find_cases(folder):
             return [finding for case in cases for finding in _check_case(case)]
-        if marked := sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".c3d"):
-            return [finding for file in marked for finding in check_markers(file)]
+        if c3d_files := sorted(path for path in folder.rglob("*") if path.suffix.lower() == ".c3d"):
+            return [finding for file in c3d_files for finding in check_markers(file)]
     files = sorted(filter(Path.is_file, folder.rglob("*"))) if folder.is_dir() else [folder]
     found = [kind.check(file, config or Config()) for file in files for kind in LAYOUTS.values() if kind.recognizes(file)]
     if not found:
@@ -78,7 +79,7 @@ def check_layout(folder: Path, config: Config | None = None) -> list[Finding]:
 
 
 def check_capture(folder: Path) -> list[Finding]:
-    """Description, calibration, every image, masks, points in space; writes the contact sheet into the folder."""
+    """Check description, calibration, every image, masks and points in space; write the contact sheet into the folder."""
     path = folder / CAPTURE
     try:
         description = read_description(path)
@@ -109,11 +110,15 @@ def check_capture(folder: Path) -> list[Finding]:
             try:
                 controllers = np.zeros((capture.frame_count, 0, 3)) if space.hands is None else space.hands.points
                 draw_sheet(capture, controllers, space.annotated, folder / SHEET_FILE)
-                findings.append(note(folder / SHEET_FILE, "look at it: grids on the table, dots on the object, outlines around it"))
+                findings.append(
+                    note(folder / SHEET_FILE, "look at it: grids belong on the table, dots on the object, outlines around it")
+                )
             except InputError as error:
                 findings.append(replace(refusal(error), level="note"))
     if capture.cameras and not description.masks:
-        findings.append(note(path, f"no masks yet (masks: false). Draw them: `neuspring annotate {folder}`; then check again"))
+        findings.append(
+            note(path, f"no masks yet (masks: false). Annotate them with `neuspring annotate {folder}`, then check again")
+        )
     return findings
 
 
@@ -125,7 +130,10 @@ def at(file: Path, findings: Iterable[Finding]) -> list[Finding]:
 def _check_camera(
     capture: Capture, name: str, calibrated: bool, grips: np.ndarray, watched: Watched
 ) -> tuple[dict[int, Sample], list[Finding]]:
-    """A few frames of a camera, and all findings about its images. `grips` [T] counts hands at the object; `watched` sees all."""
+    """A few frames of a camera, and all findings about its images.
+
+    Updates `grips` [T], the number of hands at the object, and `watched`, which receives every frame.
+    """
     view, path, streams = capture.cameras[name], capture.folder / CAPTURE, capture.streams
     shown, medians = Shown(capture.frame_count, (view.width, view.height)), list[float]()
     samples, refused = dict[int, Sample](), dict[str, list[Finding]]()
@@ -147,7 +155,9 @@ def _check_camera(
         except InputError as error:
             one = refusal(error)
             refused.setdefault(f"{Path(one.where).parent} {one.text}", []).append(one)
-    more = {key: f" The same in {len(alike) - 1} more files of the folder." for key, alike in refused.items() if len(alike) > 1}
+    more = {
+        key: f" {len(alike) - 1} more files of the folder have the same fault." for key, alike in refused.items() if len(alike) > 1
+    }
     findings = [replace(alike[0], text=alike[0].text + more.get(key, "")) for key, alike in refused.items()]
     where, median = f"camera {name}", float(np.median(medians)) if medians else 0.0
     wrong_depth = examine("depths", where, median, streams=streams)
@@ -161,7 +171,7 @@ def _check_camera(
 
 
 def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> Rig:
-    """All cameras together; object and hands are no table, and the rest must be enough of the image to find one."""
+    """All cameras together. The table is searched outside object and hands, where enough of the image has depth."""
     around = {name: [np.where(one.mask == 0, one.depth, 0.0) for one in some.values()] for name, some in samples.items()}
     depths = {
         n: some if some and np.mean([(depth > 0).mean() for depth in some]) >= LEAST_AROUND else [] for n, some in around.items()
@@ -171,8 +181,8 @@ def _rig(capture: Capture, samples: Mapping[str, Mapping[int, Sample]]) -> Rig:
 
 
 def _streams(capture: Capture, watched: Mapping[str, Watched], space: InSpace) -> Iterator[Streams]:
-    """Every two streams of a capture that show one motion."""
-    again, rows = "Make the capture again, with `make-capture --shift {}={{frames}}`.", "Shift its rows by {frames}."
+    """Every two streams of a capture that show the same motion."""
+    again, rows = "Make the capture again with `make-capture --shift {}={{frames}}`.", "Shift its rows by {frames}."
     maps = in_space(watched, capture.cameras) if len(watched) > 1 else {}
     files = {"controllers": None if space.hands is None else space.hands.points, "annotated points": space.annotated}
     for name, one in watched.items():
@@ -189,7 +199,7 @@ def _streams(capture: Capture, watched: Mapping[str, Watched], space: InSpace) -
 
 
 def check_markers(path: Path) -> list[Finding]:
-    """Contents of a C3D file, or those markers of it that FILE.c3d#LABEL,LABEL names, and every finding about their motion."""
+    """A note about the markers of a C3D file, or those that FILE.c3d#LABEL,LABEL selects, and findings about their motion."""
     try:
         markers = Markers.read(path)
     except InputError as error:
@@ -197,14 +207,14 @@ def check_markers(path: Path) -> list[Finding]:
     unseen = np.isnan(markers.points[..., 0]).sum(axis=0)
     sides = " x ".join(f"{side:.3g}" for side in np.nanmax(markers.points, axis=(0, 1)) - np.nanmin(markers.points, axis=(0, 1)))
     gaps = listed(f"{label} in {count} frames" for label, count in zip(markers.labels, unseen, strict=True) if count)
-    found = f"{len(markers.points)} frames of {markers.rate:g} Hz, within {sides} m, of {len(markers.labels)} markers: "
-    listing = note(path, found + ", ".join(markers.labels) + f"; lost: {gaps or 'none'}")
-    remedy = "Fill gaps where it was recorded, or leave the marker out: FILE.c3d#LABEL,LABEL"
+    size = f"{len(markers.points)} frames of {markers.rate:g} Hz, within {sides} m, of {len(markers.labels)} markers: "
+    listing = note(path, size + ", ".join(markers.labels) + f"; lost: {gaps or 'none'}")
+    remedy = "Fill gaps in the recording software, or select other markers: FILE.c3d#LABEL,LABEL"
     return [listing, *examine("moving", path, Moving(markers.points, markers.rate), remedy)]
 
 
 def find_cases(folder: Path) -> list[Path]:
-    """The folders of cases in or below `folder`. Raises InputError for a root with data/different_types that holds none."""
+    """The case folders in or below `folder`. Raises InputError for a root with data/different_types but without cases."""
     below = folder / "data" / "different_types"
     cases = [folder] if is_case(folder) else _subfolders(below) if below.is_dir() else list(filter(is_case, _subfolders(folder)))
     if below.is_dir() and not cases:
@@ -213,12 +223,12 @@ def find_cases(folder: Path) -> list[Path]:
 
 
 def is_case(folder: Path) -> bool:
-    """True where the folder holds a processed or a raw case."""
+    """True if the folder contains a processed or raw case."""
     return any((folder / name).exists() for name in (FINAL_DATA, SPLIT, phystwin.CALIBRATION))
 
 
 def _check_case(folder: Path) -> list[Finding]:
-    """What the readers of a case refuse: of its processed data, and of its raw data where it has images."""
+    """Errors of a case's readers: for its processed data, and for its raw data if it has images."""
     findings = list[Finding]()
     row = ScenarioRow(scenario=folder.name, source="phystwin", category="", path=".", self_collision=False, ground=True)
     readers: list[Callable[[], Any]] = []
@@ -246,7 +256,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def render(findings: list[Finding]) -> str:
-    """Findings as text, grouped by file, ending in 'N errors, N warnings'."""
+    """Findings as text, grouped by file; the last line is 'N errors, N warnings'."""
     ordered = sorted(findings, key=lambda d: d.where)
     lines = []
     for file, group in groupby(ordered, key=lambda d: d.where):

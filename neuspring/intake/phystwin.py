@@ -1,4 +1,4 @@
-"""PhysTwin's folders `data/different_types/{case}/`: processed cases -> Observations; the table of the 22 released cases."""
+"""Read PhysTwin's processed cases, `data/different_types/{case}/`, as Observations; table of the 22 released cases."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ FINAL_DATA, SPLIT, GT_TRACKS, METADATA, CALIBRATION = (
     "calibrate.pkl",
 )
 FILES = (FINAL_DATA, SPLIT, GT_TRACKS, METADATA)
-"""The files that the reader looks for in a processed case's folder."""
+"""Files of a processed case that the reader uses."""
 RAW_FILES = (METADATA, CALIBRATION, SPLIT, GT_TRACKS)
-"""The files beside images that the importer looks for in a raw case's folder."""
+"""Files of a raw case that the importer uses, besides images."""
 RATE_KEYS = ("fps", "record_hz")
 RELEASED_FRAME_RATE = 30.0
-"""Frames per second of every released recording; used where metadata.json is absent."""
+"""Frames per second of every released recording; the default without metadata.json."""
 CASE_ARRAYS = {
     "object_points": (("T", "No", 3), "f"),
     "object_visibilities": (("T", "No"), "b"),
@@ -40,7 +40,7 @@ CASE_ARRAYS = {
     "surface_points": (("Ns", 3), "f"),
     "interior_points": (("Ni", 3), "f"),
 }
-"""Key -> shape, in which a letter is one size in all arrays, and NumPy's kind."""
+"""Key -> shape and NumPy's kind; equal letters are equal sizes in all arrays."""
 
 
 @cache
@@ -58,8 +58,8 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
 def read(row: ScenarioRow, folder: Path) -> Observations:
     """Read one processed case from its `folder`.
 
-    Uses final_data.pkl and split.json; gt_track_3d.pkl (else no tracks) and metadata.json (else 30 frames per second) where
-    present. Meters, float32, world with -z up. Raises InputError naming file and key.
+    Requires final_data.pkl and split.json. Optional are gt_track_3d.pkl (default: no tracks) and metadata.json (default: 30 frames
+    per second). Meters, float32; up is -z. Raises InputError with file and key.
     """
     from neuspring.checks.moving import ORDER, Moving, swapped
 
@@ -68,10 +68,10 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
     frames = len(data["object_points"])
     train_end, rate = split_and_rate(folder, frames)
     tracks = annotated(folder, frames)
-    words = swapped(Moving(data["controller_points"], rate))
-    if words and "level" in words:
+    finding = swapped(Moving(data["controller_points"], rate))
+    if finding and "level" in finding:
         rule = "controller_points: each point must keep its index in all frames"
-        raise InputError(folder / FINAL_DATA, rule, f"other orders {words['detail']}", ORDER)
+        raise InputError(folder / FINAL_DATA, rule, f"another order {finding['detail']}", ORDER)
     return Observations(
         scenario=Scenario(
             name=row.scenario,
@@ -96,16 +96,16 @@ def read(row: ScenarioRow, folder: Path) -> Observations:
 
 
 def split_and_rate(case: Path, frames: int | None = None) -> tuple[int, float]:
-    """End of training and frames per second, of the small files, which a plan reads without the number of frames.
+    """End of the training frames, and frames per second, from the small files. Raises InputError.
 
-    Raises InputError.
+    A plan reads them before the number of frames is known.
     """
     metadata = metadata_of(case) if (case / METADATA).exists() else {}
     return train_end_of(case, frames), rate_of(case / METADATA, metadata, RELEASED_FRAME_RATE)
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of final_data.pkl. Raises InputError for the first rule that they break."""
+    """Read the arrays of final_data.pkl. Raises InputError for the first broken rule."""
     data: dict[str, np.ndarray] = load_pickle(path)
     sizes = dict[str, int]()
     _require(isinstance(data, dict), path, "a dict of arrays is required", type(data).__name__)
@@ -125,9 +125,9 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
     faults = {
         "object_points: at least 2 frames and one point are required": (len(visible) < 2 or not points.size) and visible.shape,
         "controller_points: at least one controller point is required": not sizes["C"] and "none",
-        "object_visibilities: no point may be hidden in frame 0, the rest state": (~visible[:1]).sum(),
-        "object_motions_valid: no motion may be valid where its point is hidden before or after": (moves[:-1] & ~both).sum(),
-        "object_points: up is -z, and the object's median may not be below the table, m": points.size
+        "object_visibilities: all points must be visible in frame 0, the rest state": (~visible[:1]).sum(),
+        "object_motions_valid: a motion may be valid only if its point is visible before and after it": (moves[:-1] & ~both).sum(),
+        "object_points: the object's median must not be below the table (up is -z), m": points.size
         and max(0.0, np.median(points[0, :, 2])),
     }
     for rule, fault in faults.items():
@@ -141,34 +141,34 @@ def _require(kept: object, path: Path, rule: str, received: object) -> None:
 
 
 def metadata_of(case: Path) -> dict[str, Any]:
-    """metadata.json. Raises InputError."""
+    """Read metadata.json. Raises InputError."""
     metadata = load_json(case / METADATA)
     _require(isinstance(metadata, dict), case / METADATA, "a JSON object is required", type(metadata).__name__)
     return dict(metadata)
 
 
 def rate_of(path: Path, metadata: dict[str, Any], default: float | None = None) -> float:
-    """Frames per second by metadata.json: `fps`, or `record_hz` as forks call it. Raises InputError."""
+    """Frames per second in metadata.json: `fps`, or `record_hz` in forks. Raises InputError."""
     return stated(path, metadata, RATE_KEYS, "a positive number of frames per second", default)
 
 
 def stated(path: Path, metadata: dict[str, Any], keys: Sequence[str], rule: str, default: float | None = None) -> float:
-    """The one positive number that keys of metadata.json state, for all cameras or for each. Raises InputError."""
+    """The positive number that `keys` of metadata.json state, once or for each camera. Raises InputError if numbers differ."""
     given = {key: metadata[key] for key in keys if key in metadata}
     values = [one for value in given.values() for one in (value if isinstance(value, list) else [value])] or [default]
     if len(set(map(str, values))) != 1 or type(values[0]) not in (int, float) or not 0 < values[0] < 1e6:
-        raise InputError(path, f"{' or '.join(keys)}: {rule} is required, one for all cameras", given or None)
+        raise InputError(path, f"{' or '.join(keys)}: {rule} is required, the same for all cameras", given or None)
     return float(values[0])
 
 
 def has_images(case: Path) -> bool:
-    """True where a case's folder holds what a capture with masks needs: images, masks and calibration."""
+    """True if a case contains what a capture with masks needs: images, masks and calibration."""
     files = all((Path(case) / name).is_file() for name in (METADATA, CALIBRATION))
     return files and all((Path(case) / kind).is_dir() for kind in ("color", "depth", "mask"))
 
 
 def camera_count(case: Path) -> int:
-    """Number of cameras that metadata.json declares. Raises InputError."""
+    """Number of cameras in metadata.json. Raises InputError."""
     intrinsics = metadata_of(Path(case)).get("intrinsics")
     if not isinstance(intrinsics, list) or not intrinsics:
         raise InputError(Path(case) / METADATA, "intrinsics: a list of 3 x 3 matrices is required", type(intrinsics).__name__)
@@ -188,7 +188,7 @@ def annotated(case: Path, frames: int) -> np.ndarray | None:
 
 
 def train_end_of(case: Path, frames: int | None) -> int:
-    """Training frames are [0, this) as split.json states. Raises InputError."""
+    """The end of the training frames [0, end), from split.json. Raises InputError."""
     split = load_json(case / SPLIT)
     for key in ("train", "test"):
         value = split.get(key) if isinstance(split, dict) else None

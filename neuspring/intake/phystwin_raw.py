@@ -1,7 +1,7 @@
-"""A case in PhysTwin's raw layout: images of all cameras, calibration, and masks, one image per detection.
+"""Cases in PhysTwin's raw layout: images of all cameras, calibration, and masks with one image per detection.
 
-Images of a scenario are linked where the file system allows it, else copied. A frame whose color or depth a camera does not have is
-`missing` there.
+The importer links images if the file system allows it, and otherwise copies them. A frame without color or depth of a camera is
+`missing` for this camera.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ BINARY_TOLERANCE = 1e-5
 """Allowed deviation from R^T R = 1 in a pickle of float64 products of OpenCV rotations."""
 STREAMS: dict[Literal["color", "depth"], str] = {"color": ".png", "depth": ".npy"}
 UNIT_KEY = "depth_scale_m_per_unit"
-"""Key of metadata.json, m per count; 0.001 in released cases, which do not have it."""
+"""Key of metadata.json, m per count; the released cases do not have it and use 0.001."""
 
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
@@ -46,9 +46,9 @@ def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) ->
 
 
 def read(name: str, category: str, case: Path) -> tuple[Description, list[Camera], dict[str, dict[int, list[str]]]]:
-    """What a case states, for its capture and for check-data: the description, the cameras, and each camera's detections by label.
+    """Read a case's description, its cameras, and each camera's detections by label; without masks there are no detections.
 
-    There are no detections without masks. Raises InputError.
+    Raises InputError.
     """
     metadata, cameras = read_calibration(case)
     frames, has_masks = int(metadata["frame_num"]), (case / "mask").is_dir()
@@ -77,13 +77,13 @@ def read(name: str, category: str, case: Path) -> tuple[Description, list[Camera
         frame = next((frame for frame in range(frames) if frame not in missing[camera.name]), 0)
         first = case / "depth" / camera.name / f"{frame}.npy"
         if (dtype := read_array(first, camera).dtype) != np.uint16:
-            remedy = f"Write uint16, and the unit as {UNIT_KEY} of {METADATA} (m per count), if it is not 0.001."
+            remedy = f"Write uint16. If the unit is not 0.001 m per count, state it as {UNIT_KEY} of {METADATA}."
             raise InputError(first, "depth must be 16-bit counts", dtype, remedy)
     return description, cameras, {camera.name: detections(case, camera.name) for camera in cameras if has_masks}
 
 
 def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
-    """Write `case` as a capture folder. Raises InputError naming file and key."""
+    """Write `case` as a capture folder. Raises InputError with file and key."""
     description, cameras, ids = read(name, category, case)
     writer, frames = Writer(folder, description), description.frame_count
     for camera in cameras:
@@ -96,7 +96,7 @@ def convert(name: str, category: str, case: Path, folder: Path) -> Capture:
 
 
 def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
-    """metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
+    """Read metadata.json, and the cameras in it and in calibrate.pkl, named by their numbers. Raises InputError."""
     path, metadata, poses = case / METADATA, metadata_of(case), load_pickle(case / CALIBRATION)
     size, count = metadata.get("WH"), metadata.get("frame_num")
     if not (isinstance(size, list) and len(size) == 2 and all(type(value) is int and value > 0 for value in size)):
@@ -121,22 +121,22 @@ def read_calibration(case: Path) -> tuple[dict[str, Any], list[Camera]]:
 
 
 def detections(case: Path, camera: str) -> dict[int, list[str]]:
-    """Label -> ids of its detections. Exactly one detection is not a hand."""
+    """Label -> ids of its detections. Raises InputError unless exactly one detection is not a hand."""
     path = case / "mask" / f"mask_info_{camera}.json"
     info = load_json(path)
     if not isinstance(info, dict) or not all(isinstance(v, str) for v in info.values()):
         folders = sorted(folder.name for folder in (case / "mask" / camera).glob("*/"))
-        rule = f'detections by phrase are required, one for each folder of mask/{camera}, as {{"0": "plush", "1": "hand"}}'
+        rule = f'a phrase for each folder of mask/{camera} is required, like {{"0": "plush", "1": "hand"}}'
         raise InputError(path, rule, info, f"Name these folders: {', '.join(folders)}.")
     objects = [key for key, phrase in info.items() if phrase != "hand"]
     if len(objects) != 1:
-        rule = "exactly one detection must not be 'hand': the object"
-        raise InputError(path, rule, info, "Remove the others from this file, or give them the phrase 'hand'.")
+        rule = "exactly one detection, the object, must have a phrase other than 'hand'"
+        raise InputError(path, rule, info, "Remove other detections from this file, or give them the phrase 'hand'.")
     return {OBJECT: objects, HANDS: [key for key in info if key not in objects]}
 
 
 def labels_of(case: Path, camera: Camera, frame: int, ids: dict[int, list[str]]) -> np.ndarray:
-    """Mask [H, W] uint8 of one frame, put together from the images of its detections. Raises InputError."""
+    """Mask [H, W] uint8 of one frame, combined from the images of its detections. Raises InputError."""
     labels = np.zeros((camera.height, camera.width), dtype=np.uint8)
     for label, names in sorted(ids.items()):
         for name in names:

@@ -1,5 +1,5 @@
 """Sources of scenarios.
 
-`sources` declares every kind of data and reads the table of scenarios. `toy` makes small scenes without video; `shapes`, `render`
-and `rays` are a camera that films meshes.
+`sources` declares every kind of data and reads the scenario table. `toy` creates small scenes without video. `shapes`, `render` and
+`rays` render meshes as a depth camera sees them.
 """

@@ -1,4 +1,4 @@
-"""Warp kernels of the ray caster: one pixel from rays to the mesh, the table and the light."""
+"""Warp kernels of the ray caster, which trace one pixel to the mesh, the table and the light."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import warp as wp
 
 
 def on_cpu(values: np.ndarray, kind: Any) -> Any:
-    """A Warp array in the memory of the CPU."""
+    """A Warp array in CPU memory."""
     return wp.array(values, dtype=kind, device="cpu")
 
 
 @wp.func
 def grain(place: wp.vec3, frequency: float, contrast: float, state: wp.uint32):
-    """Three octaves of noise. Finer ones would be smaller than a pixel and glitter."""
+    """Three octaves of noise; finer octaves would be smaller than a pixel and flicker."""
     coarse = 0.5 * wp.noise(state, place * frequency) + 0.35 * wp.noise(state, place * (2.1 * frequency))
     return 1.0 + contrast * (coarse + 0.3 * wp.noise(state, place * (4.3 * frequency)))
 
 
 @wp.func
 def table(place: wp.vec3, state: wp.uint32):
-    """Wood: streaks along x."""
+    """Color of the wooden table, with streaks along x."""
     streak = wp.noise(state, wp.vec3(place[0] * 6.0, place[1] * 45.0, 0.3))
     pore = wp.noise(state, wp.vec3(place[0] * 90.0, place[1] * 90.0, 0.7))
     return wp.vec3(0.62, 0.50, 0.38) * (1.0 + 0.22 * streak + 0.1 * pore)
@@ -30,7 +30,7 @@ def table(place: wp.vec3, state: wp.uint32):
 
 @wp.func
 def ray_of(x: int, y: int, offset: wp.vec2, focal: wp.vec2, center: wp.vec2):
-    """Direction of a sample in the camera's axes, z forward."""
+    """Unit direction of a sample in camera axes, z forward."""
     u = (float(x) + offset[0] - center[0]) / focal[0]
     v = (float(y) + offset[1] - center[1]) / focal[1]
     return wp.normalize(wp.vec3(u, v, 1.0))
@@ -38,7 +38,7 @@ def ray_of(x: int, y: int, offset: wp.vec2, focal: wp.vec2, center: wp.vec2):
 
 @wp.func
 def to_table(origin: wp.vec3, ray: wp.vec3):
-    """Distance along a ray to the table, z = 0."""
+    """Distance along a ray to the table, z = 0; 1e9 if the ray does not descend."""
     distance = 1.0e9
     if ray[2] < -1.0e-6:
         distance = -origin[2] / ray[2]
@@ -49,7 +49,7 @@ def to_table(origin: wp.vec3, ray: wp.vec3):
 def shade_table(
     pose: wp.transform, focal: wp.vec2, center: wp.vec2, offsets: wp.array[wp.vec2], farthest: float, shades: wp.array3d[wp.vec3]
 ):
-    """The empty table's color in every sample, before light falls on it: a camera and its table do not move."""
+    """Unlit color of the empty table in every sample; computed once, because camera and table do not move."""
     y, x, s = wp.tid()
     ray = wp.transform_vector(pose, ray_of(x, y, offsets[s], focal, center))
     origin = wp.transform_get_translation(pose)
@@ -80,7 +80,7 @@ def cast(
     label: wp.array2d[wp.uint8],
     slope: wp.array2d[float],
 ):
-    """One pixel: color is the mean over `offsets`, depth, label and slope are those of the first; `shades` by `shade_table`."""
+    """One pixel: color is the mean over `offsets`; depth, label and slope are from the first. `shades` is from `shade_table`."""
     y, x = wp.tid()
     origin = wp.transform_get_translation(pose)
     state = wp.uint32(7)

@@ -1,9 +1,10 @@
-"""A depth camera: a ray caster on Warp meshes (color, depth along the optical axis, and who is seen: 0 table, 1 object, 2
-hand), and the sensor's flaws: noise that grows with distance and is alike in neighboring pixels, dropouts at edges and on grazing
-surfaces, holes, quantization.
+"""A synthetic depth camera: a ray caster on Warp meshes, and a model of the sensor.
 
-Texture is a function of rest coordinates, so it sticks to the material. Pixel centers lie at whole coordinates, x right, y down, z
-forward (OpenCV); the table is the plane z = 0.
+The ray caster renders color, depth along the optical axis, and labels: 0 table, 1 object, 2 hand. The sensor adds noise that grows
+with distance and is correlated between neighboring pixels, dropouts at edges and on grazing surfaces, holes, and quantization.
+
+Texture is a function of rest coordinates, so it moves with the material. Pixel centers have integer coordinates: x right, y down, z
+forward (OpenCV). The table is the plane z = 0.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from neuspring.data.camera import Camera
 from neuspring.scenes.rays import cast, on_cpu, shade_table
 
 LIGHT = np.array([0.35, -0.45, 0.85]) / np.linalg.norm([0.35, -0.45, 0.85])
-"""Direction to the light."""
+"""Unit vector towards the light."""
 FARTHEST_HIT = 8.0
-"""m; what lies further is background without depth."""
+"""m. Surfaces farther away are background without depth."""
 SUBPIXELS = np.array([[0.0, 0.0], [0.25, 0.25], [-0.25, 0.25], [0.25, -0.25]])
-"""The place where a pixel's color is sampled; depth and label are those of the first."""
+"""Positions within a pixel at which color is sampled; the first one also gives depth and label."""
 GAMMA = 1.0 / 2.2
 SKIN_COLOR = (0.75, 0.5, 0.4)
 """Linear RGB."""
@@ -32,10 +33,10 @@ SKIN_COLOR = (0.75, 0.5, 0.4)
 
 @dataclass(frozen=True)
 class Part:
-    """One thing that is seen: its triangles, where its texture lives, its colors."""
+    """One rendered mesh, its texture coordinates and its colors."""
 
     rest: np.ndarray
-    """[V, 3], m."""
+    """[V, 3], m: vertices at rest, the coordinates of the texture."""
     faces: np.ndarray
     """[F, 3]."""
     colors: np.ndarray
@@ -47,7 +48,7 @@ class Part:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """View of one camera in one frame."""
+    """The view of one camera in one frame."""
 
     color: np.ndarray
     """[H, W, 3] uint8 RGB."""
@@ -60,7 +61,7 @@ class RenderedView:
 
 
 class Renderer:
-    """Renders parts whose vertices move, on the CPU."""
+    """Renders moving meshes on the CPU."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
         counts = np.cumsum([0, *(len(part.rest) for part in parts)])
@@ -84,7 +85,7 @@ class Renderer:
         self._sum_faces = coo_matrix((np.ones(len(corners)), (corners, owners)), shape=(int(counts[-1]), len(self._faces))).tocsr()
 
     def move(self, vertices: Sequence[np.ndarray]) -> None:
-        """Place the vertices of every part, m."""
+        """Set the vertices of every part, m."""
         points = np.concatenate(vertices).astype(np.float32)
         corners = points[self._faces]
         normals = self._sum_faces @ np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -97,8 +98,8 @@ class Renderer:
             self._mesh.refit()
 
     def render(self, camera: Camera) -> RenderedView:
-        """The present view of `camera`."""
-        assert self._mesh is not None, "move() comes first"
+        """Render the current view of `camera`."""
+        assert self._mesh is not None, "call move() first"
         size = (camera.height, camera.width)
         color = wp.zeros((*size, 3), dtype=wp.uint8, device="cpu")
         depth, slope = (wp.zeros(size, dtype=wp.float32, device="cpu") for _ in range(2))
@@ -121,23 +122,23 @@ class Renderer:
 NOISE_NEAR, NOISE_FAR = 0.0008, 0.0019
 """Standard deviation of depth, m: near + far (z - 0.4)^2, z in m (the form of Nguyen et al. 2012 for structured light)."""
 CORRELATION = 1.2
-"""Width of the noise's grain, pixels."""
+"""Standard deviation of the blur that correlates the noise, pixels."""
 EDGE_STEP = 0.02
-"""Neighboring pixels that differ by more, m, make an edge."""
+"""m. Neighboring pixels whose depths differ by more are an edge."""
 EDGE_LOSS = 0.6
-"""Share of pixels at an edge without depth."""
+"""Fraction of edge pixels without depth."""
 GRAZING = 0.18
 """Cosine between normal and ray below which depth is lost."""
 HOLES = 0.004
-"""Share of the image in holes anywhere."""
+"""Fraction of the image in random holes."""
 HOLE_SIZE = 2.5
-"""Width of holes, pixels."""
+"""Standard deviation of the blur that shapes the holes, pixels."""
 
 
 def measured(depth: np.ndarray, slope: np.ndarray, unit: float, rng: np.random.Generator) -> np.ndarray:
-    """Depth [H, W] as a sensor gives it: uint16 in units of `unit` m, 0 where it gives nothing.
+    """Depth [H, W] as a sensor measures it: uint16 in units of `unit` m, 0 without a measurement.
 
-    `depth` is the truth, m, 0 where nothing is; `slope` the cosine between surface and ray.
+    `depth` [H, W] is the truth, m, 0 for background; `slope` [H, W] is the cosine between surface normal and ray.
     """
     grain = cv2.GaussianBlur(rng.normal(size=depth.shape), (0, 0), CORRELATION)
     noise = grain / grain.std() * (NOISE_NEAR + NOISE_FAR * (depth - 0.4) ** 2)
@@ -155,7 +156,7 @@ def quantized(depth: np.ndarray, unit: float) -> np.ndarray:
 
 
 def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera-to-world [4, 4]: z towards the target, y down."""
+    """Camera-to-world pose [4, 4], m: z towards the target, y down."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

@@ -1,7 +1,7 @@
 """Shapes as signed distance functions, and their triangle surfaces.
 
-Distances [...] of points [..., 3], m, are negative inside. The ellipsoid and the smooth union are approximate distances with exact
-signs away from the blend, which is all that meshing needs.
+Distances [...] of points [..., 3], m, are negative inside. Distances to ellipsoids and smooth unions are approximate. Their signs
+are exact away from the blend, which is sufficient for meshing.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def surface(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: floa
     counts = np.ceil((np.asarray(high, float) - first) / spacing).astype(int) + 1
     distances = sdf((first + spacing * grid(counts)).reshape(-1, 3)).reshape(counts)
     values = on_cpu(distances, wp.float32)
-    # The extractor rejects a grid's bounds in two forms: lattice coordinates are the plain one, scaled here.
+    # The extractor does not accept the bounds of this grid, so it returns lattice coordinates that are scaled here.
     points, indices = IsoSurfaceMarchingCubes.extract_surface_marching_cubes(values, 0.0)  # type: ignore[arg-type]
     vertices, faces = first + spacing * points.numpy().astype(float), indices.numpy().reshape(-1, 3)
     corners = vertices[faces]

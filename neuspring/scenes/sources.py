@@ -1,12 +1,13 @@
-"""Sources of scenarios: `SOURCES` declares every kind of data, and everybody asks it.
+"""Sources of scenarios: `SOURCES` declares every kind of data; all other code reads it.
 
-To add a source: a module that reads it, its line here, and rows of the scenario table; if it has settings, a section of
-`neuspring.config.data`. A package adds one, a `Source`, by an entry point of the group `neuspring.sources`. Its module has
+To add a source, write a module that reads its data, add a `Source` here, and add lines to the scenario table. A source with
+settings also needs a section of `neuspring.config.data`. A package adds a `Source` with an entry point of the group
+`neuspring.sources`. The module contains
 
-    observe(row, path, config, output) -> Observations     where it is not filmed; truth may be written beside `output`
-    write_capture(row, path, config, folder)                where it is filmed, or has images beside processed data
+    observe(row, path, config, output) -> Observations     for data without video; it may write the truth next to `output`
+    write_capture(row, path, config, folder)                for video, or images next to processed data
 
-with `path` where its data lie.
+`path` is the location of the data.
 """
 
 from __future__ import annotations
@@ -30,67 +31,67 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A kind of data. Its module is named, and imported when it is used."""
+    """A kind of data. Its module is imported on first use."""
 
     module: str
-    """Reads its data; rules carry the digest of this module's code."""
+    """Name of the module that reads the data; Snakemake rules depend on the digest of its code."""
     reads: tuple[str, ...]
     """Keys of the configuration that reading depends on."""
     films: bool = False
-    """Raw video: perception makes observations of its capture."""
+    """True for raw video: perception makes observations from its capture."""
     write_capture: str = ""
-    """The module that writes its captures. None: the user supplies the capture, or there are no images."""
+    """Name of the module that writes captures. Empty: the user supplies the capture, or there are no images."""
     needs_data: bool = True
-    """True where it lies under data_root."""
+    """True if the data are below data_root."""
     has_truth: bool = False
-    """Its captures have the truth beside them."""
+    """True if each capture has a file with its truth."""
     own: bool = False
-    """True for films of users: methods that learn nothing stand beside the others, and tables say what to be careful with."""
+    """True for recordings of users: comparisons include methods that learn nothing, and tables contain cautions."""
     files: tuple[str, ...] = ()
-    """Files of its folder that observations are read from; none: the path itself."""
+    """Files of the scenario's folder from which observations are read; empty: the path itself."""
     needed: tuple[str, ...] = ()
-    """Files of its folder without which no job can run; none: the path itself."""
+    """Files of the scenario's folder without which no job can run; empty: the path itself."""
     remedy: str = "Correct data_root, or the scenario's name or path."
-    """The next move where data are not there, a format string over `data_root`."""
+    """Next move for missing data, a format string with `data_root`."""
     capture_files: tuple[str, ...] = ()
-    """Files of its folder that a capture is made from, beside images."""
+    """Files of the scenario's folder, besides images, from which a capture is made."""
     images_beside: Callable[[Path], bool] = lambda folder: False
-    """True where images lie beside processed data, so that a capture can be made of them for pictures."""
+    """True if a folder of processed data also contains images, from which a capture for rendering can be made."""
     row_of: Callable[[str], ScenarioRow | None] = lambda name: None
-    """The row of a scenario that no table has, where its name says all of it."""
+    """Returns the row of a scenario that is in no table, if its name determines the row."""
     required: Callable[[Path], object] = lambda folder: None
-    """Raises InputError where its folder lacks what no run can do without; it reads small files alone."""
+    """Raises InputError if the folder lacks data that every run needs; reads only small files."""
     cameras: Callable[[Path, Config], tuple[str, ...]] = lambda folder, config: ()
-    """Names of the cameras before the capture is made. Raises InputError."""
+    """Returns the names of the cameras before the capture is made. Raises InputError."""
 
 
 def read_observations(row: ScenarioRow, settings: Config, output: Path) -> Observations:
-    """The observations of a scenario that is not filmed; the truth of a toy scene is written beside `output`."""
+    """Read the observations of a scenario without video. The truth of a toy scene is written next to `output`."""
     source = SOURCES[row.source]
-    assert not source.films, f"{row.source} scenarios are filmed"
+    assert not source.films, f"{row.source} scenarios are video"
     observations: Observations = import_module(source.module).observe(row, location(row, settings), settings, output)
     return observations
 
 
 def write_capture(row: ScenarioRow, settings: Config, folder: Path) -> None:
-    """A capture folder of a synthetic scene, or of PhysTwin's raw layout. Raises InputError for other sources."""
+    """Write the capture folder of a scenario whose source creates captures. Raises InputError for other sources."""
     source = SOURCES[row.source]
     if not source.write_capture:
         makers = ", ".join(name for name, other in SOURCES.items() if other.write_capture)
-        raise InputError(f"scenario {row.scenario}, source", f"captures are made of {makers} scenarios", row.source)
+        raise InputError(f"scenario {row.scenario}, source", f"captures are made only from {makers} scenarios", row.source)
     import_module(source.write_capture).write_capture(row, location(row, settings), settings, folder)
 
 
 def location(row: ScenarioRow, settings: Config) -> Path:
-    """The place where the data of a scenario lie."""
+    """The path of a scenario's data."""
     return Path(settings.data_root or ".") / row.path
 
 
 def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = ()) -> dict[str, ScenarioRow]:
-    """All scenarios, name -> row: those of the table, which lies below `root`, and each capture in `data_root` that no row names.
+    """All scenarios, name -> row: those of the scenario table below `root`, and every other capture in `data_root`.
 
-    Such a capture needs no row: its folder is the scenario's name, and capture.json says the rest. What the configuration or `also`
-    names needs none either, where a source knows the name (`Source.row_of`). Raises InputError.
+    A capture needs no row: its folder's name is the scenario, and capture.json contains the rest. Names in the configuration or
+    `also` need no row if a source determines it from the name (`Source.row_of`). Raises InputError.
     """
     rows = read_scenarios(root / settings.scenario_table)
     groups = [*(settings.pools or {}).items(), *(settings.transfers or {}).items()]
@@ -103,23 +104,23 @@ def scenario_rows(settings: Config, root: Path = Path(), also: Iterable[str] = (
             if name not in rows:
                 rows[name] = row_of_capture(path)
         except InputError:
-            # Another capture that is damaged is no reason to stop.
+            # A damaged capture that is not selected must not stop the run.
             if name in settings.scenarios:
                 raise
     return rows
 
 
 def row_of_capture(path: Path) -> ScenarioRow:
-    """The row that a capture.json stands for, where the table has none. Raises InputError."""
-    own, name = capture.read_description(path), path.absolute().parent.name
-    touches = own.category == "cloth" if own.self_collision is None else own.self_collision
-    source = "capture" if own.cameras else "points"
-    values = {"scenario": name, "source": source, "category": own.category, "path": name}
-    return parse(ScenarioRow, values | {"self_collision": touches, "ground": own.ground}, str(path))
+    """The row of a capture that is not in the scenario table. Raises InputError."""
+    description, name = capture.read_description(path), path.absolute().parent.name
+    touches = description.category == "cloth" if description.self_collision is None else description.self_collision
+    source = "capture" if description.cameras else "points"
+    values = {"scenario": name, "source": source, "category": description.category, "path": name}
+    return parse(ScenarioRow, values | {"self_collision": touches, "ground": description.ground}, str(path))
 
 
 def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
-    """The scenario table (tab-separated, one header line, `#` comments): name -> row. Raises InputError."""
+    """Read the scenario table (tab-separated, one header line, `#` comments): name -> row. Raises InputError."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     columns = [f.name for f in dataclasses.fields(ScenarioRow)]
     if not lines or lines[0].split("\t") != columns:
@@ -149,16 +150,16 @@ def read_scenarios(path: Path) -> dict[str, ScenarioRow]:
 def _required_capture(folder: Path) -> None:
     capture.require_finished(folder)
     if not (folder / capture.CAPTURE).exists():
-        remedy = "Correct the path in the scenario table, or data_root, or make a capture: `neuspring make-capture --help`."
-        raise InputError(folder, "a capture is a folder with capture.json", "a folder without", remedy)
+        remedy = "Correct data_root or the path in the scenario table, or make a capture: `neuspring make-capture --help`."
+        raise InputError(folder, "a capture must be a folder with capture.json", "a folder without it", remedy)
     if _filmed(folder) is False:
-        raise InputError(folder, "the source capture is for film", "a capture without cameras", "Write points as its source.")
+        raise InputError(folder, "the source capture requires video", "a capture without cameras", "Change the source to points.")
     if any((folder / name).exists() for name in IN_SPACE):
         _required_in_space(folder)
 
 
 def _filmed(folder: Path) -> bool | None:
-    """True where a capture has cameras; None where its description cannot be read, which the jobs of its scenario say."""
+    """True if a capture has cameras; None if its description is unreadable, which the jobs of its scenario report."""
     try:
         return bool(capture.read_description(folder / capture.CAPTURE).cameras)
     except InputError:
@@ -167,7 +168,7 @@ def _filmed(folder: Path) -> bool | None:
 
 def _required_points(folder: Path) -> None:
     if _filmed(folder):
-        raise InputError(folder, "the source points is for captures without cameras", "a film", "Write capture as its source.")
+        raise InputError(folder, "the source points is only for captures without cameras", "video", "Change the source to capture.")
     _required_in_space(folder)
 
 
@@ -223,8 +224,8 @@ SOURCES = Registry(
             files=phystwin.FILES,
             needed=(phystwin.FINAL_DATA, phystwin.SPLIT),
             required=phystwin.split_and_rate,
-            remedy="Bring them: `neuspring fetch phystwin --data-root {data_root} --parts data results images`; or name the folder "
-            "above data/different_types: --config data_root=...",
+            remedy="Run `neuspring fetch phystwin --data-root {data_root} --parts data results images`, or state the folder above "
+            "data/different_types: --config data_root=...",
             capture_files=phystwin.RAW_FILES,
             images_beside=phystwin.has_images,
             cameras=_counted,

@@ -1,8 +1,12 @@
-"""Toy scenes with known truth: a rope, a cloth and a blob, simulated by the float64 reference, then observed imperfectly.
+"""Toy scenes with known truth: a rope, a cloth and a blob, simulated by the float64 reference.
 
-A scene is named `shape/motion/field` in the scenario table:
-shape rope | cloth | blob; motion lift (up and back down) | shake (sideways, growing); field smooth | two_region, the spatial
-law of the true stiffness. Observation adds noise and occlusion; the truth (a Twin) is kept apart for identifiability studies.
+The path of a scene in the scenario table is `shape/motion/field`:
+
+- shape: rope, cloth or blob
+- motion: lift (up and back down) or shake (sideways, growing)
+- field: smooth or two_region, the spatial distribution of the true stiffness
+
+Observations contain noise and occlusion. The truth (a Twin) is stored separately, for studies of identifiability.
 """
 
 from __future__ import annotations
@@ -29,19 +33,19 @@ TOY_ANNOTATED = 16
 
 @dataclass(frozen=True, kw_only=True)
 class ToyObservation(Toy):
-    """The settings with what the observation of a scene lacks."""
+    """The settings of toy scenes, and the imperfections of their observations."""
 
     noise: float = 0.0005
     """Standard deviation of the observation noise, m."""
     occlusion: float = 0.2
-    """Fraction of point-frames hidden, in runs of several frames."""
+    """Fraction of hidden point-frames, in runs of several frames."""
     seed: int = 0
-    """Seed of noise and occlusion; the scenario's name enters too."""
+    """Seed of noise and occlusion, combined with the scenario's name."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A body at rest: nodes in canonical order (tracked, surface, interior), hands, and how it is connected. Meters."""
+    """An object at rest: nodes in canonical order (tracked, surface, interior), controllers (`hands`) and connections. Meters."""
 
     tracked: np.ndarray
     surface: np.ndarray
@@ -98,7 +102,7 @@ FIELDS = ("smooth", "two_region")
 
 
 def hand_motion(kind: str, hands: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Controller positions [T, C, 3], starting at rest. lift: 20 cm up and half way back; shake: sideways, growing to 8 cm."""
+    """Controller positions [T, C, 3], m, from rest. lift: 20 cm up and halfway back; shake: sideways, growing to 8 cm."""
     phase = times / times[-1]
     move = np.zeros((len(times), 3))
     if kind == "lift":
@@ -111,7 +115,7 @@ def hand_motion(kind: str, hands: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def true_stiffness(kind: str, shape: Shape, topology: Topology) -> np.ndarray:
-    """Stiffness [S], N, at spring midpoints: log Y varies by a factor of 2 either way along `shape.along`."""
+    """Stiffness [S], N, at spring midpoints: half to twice `shape.stiffness`, varying along `shape.along`."""
     ends = np.concatenate([topology.nodes, topology.controllers]).astype(np.float64)[topology.springs]
     position = ends.mean(axis=1) @ shape.along
     low, high = position.min(), position.max()
@@ -122,7 +126,7 @@ def true_stiffness(kind: str, shape: Shape, topology: Topology) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ToyScene:
-    """Observations that may be seen, and the truth behind them."""
+    """Observations for methods, and the truth behind them."""
 
     observations: Observations
     truth: Twin
@@ -131,7 +135,7 @@ class ToyScene:
 
 
 def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Observations:
-    """See `neuspring.scenes.sources`. The truth is written beside `output`; no method reads it."""
+    """See `neuspring.scenes.sources`. Writes the truth next to `output`; no method reads it."""
     scene = make(row, ToyObservation(**vars(config.toy)))
     scene.truth.save(output.with_name("truth.npz"))
     return scene.observations
@@ -172,7 +176,7 @@ def _true_twin(row: ScenarioRow, shape: Shape, field: str) -> Twin:
         frame_time=1.0 / TOY_FRAME_RATE, substeps=1, up="+z", ground=row.ground, self_collision=row.self_collision
     )
     twin = Twin(topology=topology, material=material, simulation=simulation)
-    # Half of what stability allows, so that the truth's own time-stepping error stays small.
+    # Half of the stable step keeps the time-stepping error of the truth small.
     return stability.with_substeps(twin, stability.needed_substeps(twin, 0.25))
 
 
@@ -212,7 +216,7 @@ def _observe(row: ScenarioRow, shape: Shape, motion: np.ndarray, hands: np.ndarr
 
 
 def _visibility(rng: np.random.Generator, frames: int, points: int, fraction: float) -> np.ndarray:
-    """[T, No] bool: each point is hidden in runs of several frames until `fraction` of its frames are; never in frame 0."""
+    """[T, No] bool: each point is hidden in runs of several frames, in about `fraction` of its frames, but never in frame 0."""
     visible = np.ones((frames, points), dtype=bool)
     wanted = int(fraction * frames)
     for point in range(points):

@@ -183,8 +183,8 @@ def test_what_is_wrong_with_every_mask_is_reported_once(capture):
         cv2.imwrite(str(capture.path("mask", "0", frame)), np.repeat(capture.mask("0", frame)[..., None], 3, axis=2))
     found = of_level(check_layout(capture.folder), "error")
     assert len(found) == 1
-    assert "00000.png: masks are gray, palette or one-bit images; received 3 channels" in found[0]
-    assert found[0].endswith("The same in 5 more files of the folder.")
+    assert "00000.png: masks must be gray, palette or one-bit images; received 3 color" in found[0]
+    assert found[0].endswith("5 more files of the folder have the same fault.")
 
 
 def test_an_object_without_depth_and_repeated_images(capture):

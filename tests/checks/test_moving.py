@@ -82,7 +82,7 @@ def test_an_order_that_changes_from_frame_to_frame_is_an_error(right):
     points, rng = right(), np.random.default_rng(0)
     (found,) = seen(np.stack([rng.permutation(row) for row in points]))
     assert (found.name, found.level) == (SWAPPED, "error") and len(found.frames) > 0.9 * FRAMES
-    assert "in frames 1 to " in found.text and "times those in the best order" in found.text
+    assert "in frames 1 to " in found.text and "times as large as in the best order" in found.text
     assert found.value > 2 * FRAMES and found.remedy.startswith("Write each point at the same index")
 
 

@@ -21,8 +21,8 @@ ONE = Check(
 def test_there_are_at_most_45_checks_and_the_page_has_them():
     assert len(table.checks) <= 45
     page = files("neuspring.data").joinpath("README.md").read_text()
-    assert table.rows() in page
     for one in table.checks:
+        assert not one.effect or one.name in page
         assert one.effect or one.limit is None, one.name
         assert one.level in ("note", "warning", "error")
     keys = [(one.name, one.of) for one in table.checks]

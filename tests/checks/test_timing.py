@@ -85,7 +85,7 @@ def test_masks_of_another_camera_are_known_by_their_motion():
     for one in watched.values():
         one.masks = watched["0"].color
     (found,) = examine("mask fit", "x", watched)
-    assert (found.where, found.level) == ("camera 1", "error") and "masks fit camera 0: 1.00, and 1: " in found.text
+    assert (found.where, found.level) == ("camera 1", "error") and "masks match camera 0: 1.00, and 1: " in found.text
     watched["1"].masks = watched["1"].color
     assert examine("mask fit", "x", watched) == []
 

@@ -36,7 +36,7 @@ def test_labels_choose_and_go_on_in_a_second_list_above_255(tmp_path):
     path = write_c3d(tmp_path / "a.c3d", many, [f"M{k}" for k in range(300)])
     read = Markers.read(Path(f"{path}#M299,M254,M255"))
     np.testing.assert_allclose(read.points, many[:, [299, 254, 255]] / 1000, rtol=1e-6)
-    with pytest.raises(InputError, match=r"labels of one marker each are required; received 'M300'\. There are: M0 "):
+    with pytest.raises(InputError, match=r"each label must name exactly one marker; received 'M300'\. Labels: M0 "):
         Markers.read(Path(f"{path}#M300"))
     twice = write_c3d(tmp_path / "b.c3d", POINTS, ("A", "A", "B"))
     with pytest.raises(InputError, match="received 'A'"):
@@ -47,16 +47,16 @@ def test_labels_choose_and_go_on_in_a_second_list_above_255(tmp_path):
 def test_a_unit_that_is_not_said_is_asked_for_and_the_answer_works(tmp_path, rest):
     path = write_c3d(tmp_path / "a.c3d", POINTS, LABELS, "")
     with pytest.raises(
-        InputError, match=rf"POINT:UNITS.*received none in the file, none given\. Say it, {path}#unit=mm{rest}"
+        InputError, match=rf"POINT:UNITS.*received none in the file, none in the path\. State the unit: {path}#unit=mm{rest}"
     ) as error:
         Markers.read(Path(f"{path}{rest.replace(',', '#')}"))
-    answer = str(error.value).rpartition("Say it, ")[2].rstrip(".")
+    answer = str(error.value).rpartition("State the unit: ")[2].rstrip(".")
     read = Markers.read(Path(answer)).points
     np.testing.assert_allclose(read, (POINTS[:, [1]] if rest else POINTS) / 1000, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("unit", "given", "move"), [("m", "#unit=mm", "Leave unit= out"), ("furlong", "", "Export it"), ("", "#unit=ft", "Say it")]
+    ("unit", "given", "move"), [("m", "#unit=mm", "Remove unit="), ("furlong", "", "Export"), ("", "#unit=ft", "State the")]
 )
 def test_a_unit_that_contradicts_or_is_unknown_is_refused(tmp_path, unit, given, move):
     path = write_c3d(tmp_path / "a.c3d", POINTS, LABELS, unit)
@@ -67,7 +67,7 @@ def test_a_unit_that_contradicts_or_is_unknown_is_refused(tmp_path, unit, given,
 def test_frames_beyond_the_counter_of_the_format_are_missed(tmp_path):
     """The library writes all of them, and reads 65,535."""
     frames = np.zeros((66_000, 1, 3))
-    with pytest.raises(InputError, match=r"its counter ends at 65,535; received 65535 of 660\d\d"):
+    with pytest.raises(InputError, match=r"at most 65,535.; received 660\d\d frames, 65535 counted"):
         Markers.read(write_c3d(tmp_path / "a.c3d", frames, ["A"]))
     assert len(Markers.read(write_c3d(tmp_path / "b.c3d", frames[:65_535], ["A"])).points) == 65_535
 
@@ -91,7 +91,7 @@ def test_a_file_of_an_sgi_processor_is_refused_with_the_way_out(tmp_path):
     whole = bytearray(path.read_bytes())
     whole[512 * (whole[0] - 1) + 3] = 86
     path.write_bytes(whole)
-    with pytest.raises(InputError, match=r"received SGI .* Export it for Intel"):
+    with pytest.raises(InputError, match=r"received SGI .* Export the file for Intel"):
         Markers.read(path)
 
 

@@ -70,8 +70,8 @@ MIRRORED[0][0] = -1.0
         ({"camera_to_world": MIRRORED}, r"camera_to_world: .*right-handed.*a mirror image"),
         ({"intrinsics": [[40.0, 1.0, 15.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]}, r"cameras\.0\.intrinsics"),
         ({"intrinsics": [[40.0, 0.0, 99.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]}, r"\(cx, cy\) must lie in the 32 x 24 image"),
-        ({"missing": [0]}, r"missing: frame 0 is where every twin starts"),
-        ({"missing": [7]}, r"frames must lie below 5; received 7"),
+        ({"missing": [0]}, r"missing: frame 0, in which every twin starts"),
+        ({"missing": [7]}, r"frames must be below 5; received 7"),
     ],
 )
 def test_bad_cameras_are_refused(tmp_path, change, message):
@@ -105,10 +105,10 @@ def test_bad_descriptions_are_refused(tmp_path, change, message):
 def test_missing_and_damaged_files_and_unknown_labels_are_refused(tmp_path):
     capture = write(tmp_path)
     capture.path("color", "0", 3).unlink()
-    with pytest.raises(InputError, match=r"00003\.png: this image must exist.* List the frame in cameras\.0\.missing"):
+    with pytest.raises(InputError, match=r"00003\.png: this image must exist.* list it in cameras\.0\.missing"):
         capture.color("0", 3)
     cv2.imwrite(str(capture.path("depth", "0", 2)), np.zeros((12, 16), np.uint16))
-    with pytest.raises(InputError, match=r"camera 0 has images of 32 x 24; received 16 x 12\. Depth must be aligned to color"):
+    with pytest.raises(InputError, match=r"images of camera 0 must be 32 x 24; received 16 x 12\. Align depth to color"):
         capture.depth("0", 2)
     capture.path("color", "0", 2).write_bytes(b"no picture")
     with pytest.raises(InputError, match="must be a readable image"):
@@ -117,7 +117,7 @@ def test_missing_and_damaged_files_and_unknown_labels_are_refused(tmp_path):
     with pytest.raises(InputError, match="depth must be 16-bit integers"):
         capture.depth("0", 1)
     cv2.imwrite(str(capture.path("mask", "0", 1)), np.ones((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match="masks are gray, palette or one-bit images; received 3 channels of color"):
+    with pytest.raises(InputError, match="masks must be gray, palette or one-bit images; received 3 color channels"):
         capture.mask("0", 1)
     cv2.imwrite(str(capture.path("mask", "0", 2)), np.full((24, 32), 7, np.uint8))
     with pytest.raises(

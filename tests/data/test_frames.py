@@ -26,8 +26,8 @@ def capture(tmp_path_factory):
 def test_a_small_far_piece_of_the_object_goes_and_the_log_says_so(capture, capsys):
     left = without_islands(capture, "0", labelled((10, 100), (60, 54)))
     np.testing.assert_array_equal(left, labelled((60, 54)))  # that one is 3 pixels from the body
-    assert "camera 0: small pieces" in (said := capsys.readouterr().out)
-    assert "1 in frames 0 to 0, the largest of 9 pixels" in said
+    assert "camera 0: removed 1 small distant pieces" in (said := capsys.readouterr().out)
+    assert "frames 0 to 0, at most 9 pixels each" in said
     assert without_islands(capture, "0", left) is not left
     assert not capsys.readouterr().out
 

@@ -118,7 +118,7 @@ REFUSED = [
     # Other uses of the names that are allowed
     (b"cnumpy\nndarray\n.", "received ndarray"),
     (b"cnumpy\nndarray\n(I4\ntR.", r"received ndarray with \(4,\)"),
-    (b"cnumpy\nndarray\n(I4\ntR(I4\ntR.", "a call of what ndarray returns"),
+    (b"cnumpy\nndarray\n(I4\ntR(I4\ntR.", "a call of the result of ndarray"),
     (b"cnumpy\ndtype\n}b.", r"received dtype and the state \{\}"),
     (b"c_codecs\nencode\n(Vx\nVrot13\ntR.", r"encode with \('x', 'rot13'\)"),
     (b"c_codecs\nencode\n(Vx\ntR.", r"encode with \('x',\)"),

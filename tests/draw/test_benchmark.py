@@ -39,7 +39,7 @@ def test_ratios_are_drawn_with_their_intervals():
         bars, markers = axis.collections
         np.testing.assert_allclose([segment[:, 0] for segment in bars.get_segments()], [[1.0, 1.3], [0.7, 1.0]])
         np.testing.assert_allclose(markers.get_offsets()[:, 0], [1.1, 0.8])
-        # Only the second interval leaves out 1.
+        # Only the second interval excludes 1.
         assert (markers.get_facecolors()[0, :3] == 1).all() and not (markers.get_facecolors()[1, :3] == 1).all()
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["far", "near"]
     plt.close(figure)

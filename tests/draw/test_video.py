@@ -87,9 +87,9 @@ def test_the_index_comes_before_the_pictures(tmp_path):
 @pytest.mark.parametrize(
     ("frames", "rule"),
     [
-        ([], "at least one picture"),
-        ([np.zeros((4, 4, 3), np.uint8), np.zeros((4, 6, 3), np.uint8)], "picture 1 .* the size of the first"),
-        ([np.zeros((4, 4, 3), np.float32)], "picture 0 .* uint8"),
+        ([], "at least one image"),
+        ([np.zeros((4, 4, 3), np.uint8), np.zeros((4, 6, 3), np.uint8)], "image 1 .* the shape of the first"),
+        ([np.zeros((4, 4, 3), np.float32)], "image 0 .* uint8"),
     ],
 )
 def test_bad_pictures_are_refused(tmp_path, frames, rule):

@@ -49,8 +49,8 @@ def of_pickle(name, value):
 
 FAULTS = [
     (of_data(put("object_points", (3, 0, 0), np.nan)), "final_data.pkl", "object_points: every coordinate must be finite"),
-    (of_data(put("object_visibilities", (0, 5), False)), "final_data.pkl", "hidden in frame 0.* received 1"),
-    (of_data(trust_hidden), "final_data.pkl", "where its point is hidden.* received 1"),
+    (of_data(put("object_visibilities", (0, 5), False)), "final_data.pkl", "visible in frame 0.* received 1"),
+    (of_data(trust_hidden), "final_data.pkl", "if its point is visible.* received 1"),
     (of_data(put("object_points", (slice(None), slice(None), 2), 0.1)), "final_data.pkl", "up is -z.* received 0.1"),
     (
         of_data(lambda d: d | {"controller_points": d["controller_points"][:, :0]}),
@@ -92,7 +92,7 @@ def test_a_conforming_case_has_only_notes_and_optional_files_may_be_missing(tmp_
 
 
 RAW_FAULTS = {
-    "mask/mask_info_1.json": ({"0": "toy", "1": "Hand"}, "exactly one detection must not be 'hand'"),
+    "mask/mask_info_1.json": ({"0": "toy", "1": "Hand"}, "exactly one detection, the object,"),
     "mask/mask_info_0.json": ({"cam_idx": 0}, "Name these folders: 0, 1"),
     "metadata.json": ({"intrinsics": [K] * 2, "frame_num": 2, "fps": 15}, "WH: two positive"),
     "split.json": ({"train": [0, 1]}, "train: whole numbers"),
@@ -124,7 +124,7 @@ def test_a_case_a_folder_of_cases_and_a_root(tmp_path):
 
 
 def test_folders_without_data_are_refused(tmp_path):
-    with pytest.raises(InputError, match="nothing there"):
+    with pytest.raises(InputError, match="no such path"):
         check_layout(tmp_path / "absent")
     with pytest.raises(InputError, match=r"final_data\.pkl"):
         check_layout(tmp_path)
@@ -149,11 +149,11 @@ def test_markers_of_c3d_files_one_by_one_with_labels_and_as_a_folder(tmp_path):
     path = write_c3d(tmp_path / "take.c3d", way, ["base", "tip - 1", "tip - 2", "elbow"], rate=100.0, lost=lost)
     found = check_layout(path)
     assert holds(found, "note", "take.c3d", "60 frames of 100 Hz, within ", "base, tip - 1, tip - 2, elbow; lost: tip - 2 in 10")
-    assert holds(found, "warning", "take.c3d", "point 1 in frame 30", "leave the marker out: FILE.c3d#LABEL")
+    assert holds(found, "warning", "take.c3d", "point 1 in frame 30", "select other markers: FILE.c3d#LABEL")
     assert [one.text for one in check_layout(tmp_path)] == [one.text for one in found]
     (alone,) = check_layout(Path(f"{path}#base,elbow"))
     assert "of 2 markers: base, elbow; lost: none" in alone.text
-    assert holds(check_layout(Path(f"{path}#hand")), "error", "take.c3d#hand", "There are: base")
+    assert holds(check_layout(Path(f"{path}#hand")), "error", "take.c3d#hand", "Labels: base")
 
 
 def test_render_groups_by_file():

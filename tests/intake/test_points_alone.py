@@ -104,7 +104,7 @@ def test_the_unloaded_shape_follows_the_points_that_stay(capture):
     # Point 3 is not seen in frame 0, and node 0 lies at point 0.
     np.testing.assert_allclose(seen.rest_shape, np.delete(rest, [3, 4], axis=0), atol=TOLERANCE)
     np.savez(capture.folder / REST, points=rest[1:])
-    with pytest.raises(InputError, match=r"rest\.npz.*the annotated points, the nodes and the controllers"):
+    with pytest.raises(InputError, match=r"rest\.npz.*annotated points, nodes and controllers"):
         read(capture)
 
 
@@ -215,7 +215,7 @@ FAULTS = [
     (
         controllers(lambda p: p + np.array([0.5, 0, 0])),
         CONTROLLERS[0],
-        ("least distance of controllers", "at most 0.06 m"),
+        ("smallest distance between grasping controllers", "at most 0.06 m"),
     ),
     (lambda f: arrays(f / CONTROLLERS[0], holds=lambda _: np.ones((8, 3), bool)), CONTROLLERS[0], ("holds", "[8, 4] bool")),
     (lambda f: arrays(f / CONTROLLERS[0], holds=lambda _: np.zeros((8, 4), bool)), CONTROLLERS[0], ("holds", "some controller")),
@@ -229,10 +229,10 @@ FAULTS = [
     (parked(True), CONTROLLERS[0], ("largest coordinate", "divide by 1000")),
     (lambda f: (f / CONTROLLERS[0]).unlink(), CONTROLLERS[0], ("a capture without cameras needs controllers.npz",)),
     (nodes(lambda p: 10000 * p), NODES[0], ("largest coordinate", "divide by 10000 if they are tenths of a millimeter")),
-    (nodes(lambda p: np.concatenate([p, p[:2]])), NODES[0], ("0.1 mm apart", "2 pairs", "Remove the doubled nodes")),
+    (nodes(lambda p: np.concatenate([p, p[:2]])), NODES[0], ("0.1 mm apart", "2 pairs", "Remove duplicate nodes")),
     (nodes(lambda p: p[:2]), NODES[0], ("at least 3 nodes", "received 2")),
-    (nodes(lambda p: p * np.array([1, 1, -8.0])), NODES[0], ("z from -0.16 to 0 m", "state --up -z")),
-    (nodes(lambda p: p + np.array([1.0, 0, 0])), TRACKS, ("largest distance of annotated points", "3 of 3", "one recording")),
+    (nodes(lambda p: p * np.array([1, 1, -8.0])), NODES[0], ("z from -0.16 to 0 m", "pass --up -z")),
+    (nodes(lambda p: p + np.array([1.0, 0, 0])), TRACKS, ("largest distance between annotated points", "3 of 3", "same recording")),
     (tracks(lambda p: p[:, :2]), TRACKS, ("at least 3 points", "2 of 2")),
     (unknown, TRACKS, ("coordinates must be finite", "point 1, frame 1", "null")),
     (lambda f: (f / TRACKS).unlink(), TRACKS, ("at least 3 points", "0 of 0")),
@@ -256,11 +256,11 @@ def test_faults_are_named_before_any_cost(capture, damage, file, words):
     ("change", "header", "words"),
     [
         (lambda rows: rows, "frame,point,x,y,z,holds,side", r"header must be frame,point,x,y,z.*side"),
-        (lambda rows: rows[1:], None, r"each point needs one row in each frame.*31 rows, 8 frames up to 7, 4 points"),
-        (lambda rows: [[row[0] + 1, *row[1:]] for row in rows], None, r"frames are 0, 1, 2.*8 frames up to 8"),
+        (lambda rows: rows[1:], None, r"each point needs one row per frame.*31 rows, 8 frames up to 7, 4 points"),
+        (lambda rows: [[row[0] + 1, *row[1:]] for row in rows], None, r"frames must be 0, 1, 2.*8 frames up to 8"),
         (lambda rows: [[*row[:5], "yes", row[6]] for row in rows], None, r"holds: every entry must be a number"),
         (lambda rows: [[*row[:5], 2, row[6]] for row in rows], None, r"holds: must be 0 or 1"),
-        (lambda rows: [[*row[:6], k] for k, row in enumerate(rows)], None, r"hand: must be one whole number for each point"),
+        (lambda rows: [[*row[:6], k] for k, row in enumerate(rows)], None, r"hand: must be one integer for each point"),
         (lambda rows: [*rows, list(range(9))], None, r"rows of numbers with one header line"),
     ],
 )
@@ -284,7 +284,7 @@ def test_a_hand_must_hold_in_some_training_frame(capture):
     late = np.zeros((8, 4), bool)
     late[6:] = True
     arrays(capture.folder / CONTROLLERS[0], holds=lambda _: late)
-    assert holds(check_layout(capture.folder), "error", CONTROLLERS[0], "hold in some training frame")
+    assert holds(check_layout(capture.folder), "error", CONTROLLERS[0], "hold the object in a training frame")
 
 
 def test_nodes_that_meet_on_the_table_are_one():
@@ -293,10 +293,10 @@ def test_nodes_that_meet_on_the_table_are_one():
 
 
 def test_a_film_and_points_alone_are_not_taken_for_each_other(capture, tmp_path):
-    with pytest.raises(InputError, match=r"the source capture is for film.*Write points"):
+    with pytest.raises(InputError, match=r"the source capture requires video.*source to points"):
         SOURCES["capture"].required(capture.folder)
     filmed = film(tmp_path / "film", cameras=1)
-    with pytest.raises(InputError, match=r"the source points is for captures without cameras.*Write capture"):
+    with pytest.raises(InputError, match=r"the source points is only for captures without cameras.*source to capture"):
         SOURCES["points"].required(filmed.folder)
 
 
@@ -309,7 +309,7 @@ def test_two_files_of_hands_are_refused(capture):
 def test_a_capture_without_cameras_says_what_it_is(capture):
     path = capture.folder / CAPTURE
     path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items() if name != "tracks"}))
-    with pytest.raises(InputError, match=r"cameras: at least one is required.*tracks: train; received none"):
+    with pytest.raises(InputError, match=r"cameras: at least one is required.*tracks is train.*received none"):
         Capture.load(capture.folder)
 
 

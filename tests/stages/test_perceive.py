@@ -111,7 +111,7 @@ def test_an_object_that_leaves_is_said(tmp_path, capsys):
         cv2.imwrite(str(capture.path("mask", "0", frame)), labels)
     segmented(capture, tmp_path, "0")
     said = capsys.readouterr().out
-    assert "frames that show almost nothing of the object: 2 frames (first is frame 4)" in said
+    assert "frames with almost no object pixels: 2 frames (first in frame 4)" in said
     facts = StageRecord.load(tmp_path / "masks.json").facts
     assert (facts["objects"], facts["frames_without_object"]) == (2, 2)
 

@@ -1,1 +1,1 @@
-"""Figures for papers and pages: `neuspring draw strip`, `twin`, `film` and `frames`."""
+"""Figures and videos for papers and pages: `neuspring draw strip`, `twin`, `film` and `frames`."""

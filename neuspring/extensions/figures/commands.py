@@ -1,4 +1,4 @@
-"""The commands `draw strip`, `twin`, `film` and `frames`. Their code is imported when they run."""
+"""The commands `draw strip`, `twin`, `film` and `frames`; their code is imported when they run."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ def draw_frames(
     appearance: Annotated[Path, arg(help="appearance.json")],
     rollout: Annotated[Path, arg(help="rollout.json")],
     camera: str,
-    output: Annotated[Path, arg(help="folder to write to")],
+    output: Annotated[Path, arg(help="folder for the images")],
     frames: Annotated[tuple[int, ...], arg(help="all by default")] = (),
     background: Literal["black", "white"] = "black",
     settings: Settings = "{}",
     device: Device = "auto",
 ) -> None:
-    """Splats and trajectory -> RGBA pictures of any camera."""
+    """Render splats with a trajectory from any camera -> RGBA images."""
     from neuspring.core.records import Before
     from neuspring.stages.render import draw_frames
 
     records, chosen = (Before.load(appearance), Before.load(rollout)), read_settings(settings)
     made = draw_frames(capture.parent, *records, camera, frames or None, background, chosen, device, output)
-    print(f"{len(made)} pictures: {output}")
+    print(f"Wrote {len(made)} images to {output}")
 
 
 def draw_strip(picture: StripOptions) -> None:
-    """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
+    """Draw observed frames on top, each method's prediction and error below -> PDF or PNG."""
     from neuspring.extensions.figures import drawing
 
     drawing.strip(picture)
 
 
 def draw_film(picture: FilmOptions) -> None:
-    """Observed beside predicted, moving -> MP4 or GIF of limited size."""
+    """Draw a video of observed and predicted frames, side by side -> MP4 or GIF of limited size."""
     from neuspring.extensions.figures import drawing
 
     drawing.film(picture)
 
 
 def draw_twin(picture: TwinOptions) -> None:
-    """Stiffness and regions of twins, from any side -> PDF or PNG."""
+    """Draw stiffness and regions of twins from any side -> PDF or PNG."""
     from neuspring.extensions.figures import drawing
 
     drawing.twin(picture)

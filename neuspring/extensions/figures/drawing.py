@@ -1,4 +1,4 @@
-"""Strips, films and twins: runs are chosen and read here, and what cannot be drawn is refused."""
+"""Strips, videos and figures of twins: selects and reads the runs, and rejects invalid options."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PICTURE_ENDINGS, FILM_ENDINGS = (".pdf", ".png", ".jpg", ".svg"), (".mp4", ".gif
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """The runs of a picture, and how they are drawn."""
+    """The selected runs and their predictions."""
 
     found: Found
     runs: list[Run]
@@ -38,7 +38,7 @@ class Chosen:
 
 
 def strip(picture: StripOptions) -> None:
-    """Observed frames on top, each method's prediction and error below -> PDF or PNG."""
+    """Draw observed frames on top, each method's prediction and error below -> PDF or PNG."""
     _require_paper(picture)
     chosen = _choose(picture)
     scenario = chosen.found.observations.scenario
@@ -52,7 +52,7 @@ def strip(picture: StripOptions) -> None:
 
 
 def film(picture: FilmOptions) -> None:
-    """Observed beside predicted, moving -> MP4 or GIF of limited size."""
+    """Draw a video of observed and predicted frames, side by side -> MP4 or GIF of limited size."""
     require_ending(picture.output, FILM_ENDINGS)
     require_between("--width", picture.width, 160, 1920)
     require_between("--megabytes", picture.megabytes, 1e-3, 100)
@@ -65,18 +65,18 @@ def film(picture: FilmOptions) -> None:
 
 
 def twin(picture: TwinOptions) -> None:
-    """Stiffness and regions of twins, from any side -> PDF or PNG."""
+    """Draw stiffness and regions of twins from any side -> PDF or PNG."""
     _require_paper(picture)
     chosen = _choose(picture, positions=picture.frame > 0)
     _frames([picture.frame], chosen.found.observations.scenario.frame_count, "--frame")
     for take, run in zip(chosen.takes, chosen.runs, strict=True):
         if take.twin is None:
             rule = "must have a twin"
-            raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Name methods with a search.")
+            raise InputError(f"--methods {run.name}", rule, "; ".join(run.notes) or "none", "Select methods with a search.")
         if picture.frame >= len(take.positions):
-            rule = f"{run.name} is predicted up to frame {len(take.positions) - 1}, then it diverged"
+            rule = f"must be at most {len(take.positions) - 1}, because {run.name} diverged after that frame"
             raise InputError("--frame", rule, picture.frame)
-    _without_splats(chosen, picture.style == "splats", "Leave out --as splats to draw springs.")
+    _without_splats(chosen, picture.style == "splats", "Remove --as splats to draw springs.")
     scene = _scene(picture, chosen, [picture.frame], chosen.takes)
     body = SurfacePicture(
         [(scene, take) for take in chosen.takes],
@@ -93,38 +93,38 @@ def twin(picture: TwinOptions) -> None:
 
 
 def _require_paper(picture: StripOptions | TwinOptions) -> None:
-    """Raise InputError for a file or a size that no picture on paper has."""
+    """Raise InputError for an invalid file or size of a figure."""
     require_ending(picture.output, PICTURE_ENDINGS)
     require_between("--width", picture.width, 1.5, 20)
     require_between("--dpi", picture.dpi, 50, 1200)
 
 
 def require_ending(path: Path, endings: Sequence[str]) -> None:
-    """Raise InputError for a file that these pictures cannot be written to, before they are drawn."""
+    """Raise InputError for an unsupported file extension or a folder, before anything is drawn."""
     if path.suffix.lower() not in endings:
-        rule = f"the file must end in {', '.join(endings[:-1])} or {endings[-1]}"
-        raise InputError("--output", rule, path.name, "neuspring draw film writes films, strip and twin write pictures.")
+        rule = f"must end in {', '.join(endings[:-1])} or {endings[-1]}"
+        raise InputError("--output", rule, path.name, "neuspring draw film writes videos; strip and twin write figures.")
     if path.is_dir():
         raise InputError("--output", "must be a file", f"the folder {path}")
     path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def require_between(name: str, value: float, least: float, most: float) -> None:
-    """Raise InputError for an option outside of its range, or not finite."""
+    """Raise InputError for an option that is not finite or outside of its range."""
     if not least <= value <= most:
         raise InputError(name, f"must be {least:g} to {most:g}", value)
 
 
 def caption(painter: PhotoPainter) -> str:
-    """Words for the text below the picture: what is shown, and the mean error of each method over its frames."""
+    """Caption of a strip: its content, and the mean distance of each method over its frames."""
     scene, scenario, manner = painter.scene, painter.scene.observations.scenario, painter.manner
     text = f"{scenario.name}, camera {scene.camera.name}, frames {', '.join(map(str, painter.frames))}"
     text += f"; future from frame {scenario.train_end}."
     text += " Dark: predicted nodes. Blue: observed points. Red: controllers." if manner.style == "nodes" else ""
     if manner.error == "color":
-        text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands left out; PSNR."
+        text += f" Difference: mean absolute color difference of object pixels, 0 to {painter.norm.vmax:g}; hands excluded; PSNR."
     elif manner.error == "distance":
-        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not seen."
+        text += f" Distance of nodes to their observed points, 0 to {painter.norm.vmax:g} mm; gray: not visible."
         means = {take.label: [distances(take, scene.observations, frame)[1].mean() for frame in painter.frames
                               if frame < len(take.positions)] for take in painter.takes}  # fmt: skip
         text += f" Mean: {', '.join(f'{name} {DRAWN_MM * np.mean(own):.1f} mm' for name, own in means.items())}."
@@ -132,31 +132,33 @@ def caption(painter: PhotoPainter) -> str:
 
 
 def _choose(a: RunOptions, *, positions: bool = True) -> Chosen:
-    """The runs that are named, read. Raises InputError."""
+    """Select and read the runs. Raises InputError."""
     found = find(a.results)
     runs = _named(a, found)
     labels = list(a.labels) or [run.method if len({r.method for r in runs}) == len(runs) else run.name for run in runs]
     if len(labels) != len(runs):
-        raise InputError("--labels", f"one name for each of {len(runs)} methods is required", len(labels))
+        raise InputError("--labels", f"must have one name for each of {len(runs)} methods", len(labels))
     return Chosen(
         found, runs, [_take(run, label, positions) for run, label in zip(runs, labels, strict=True)], resolve_device(a.device)
     )
 
 
 def _named(a: RunOptions, found: Found) -> list[Run]:
-    """The runs of --methods in their order; of a method without seed the first one. Without --methods those to begin with."""
+    """The runs of --methods in order; METHOD selects its first seed. Without --methods, the default runs (`Found.shown`)."""
     names = a.methods or found.shown
-    chosen = [run for name in names if (run := next((one for one in found.runs if name in (one.name, one.method)), None))]
+    chosen = [run for name in names if (run := next((known for known in found.runs if name in (known.name, known.method)), None))]
     if len(chosen) < len(names):
-        rule = f"{found.folder} has the methods {', '.join(dict.fromkeys(run.method for run in found.runs))}"
-        raise InputError("--methods", rule, ", ".join(a.methods), "Name METHOD or METHOD/SEED.")
+        rule = f"must be runs in {found.folder}: {', '.join(dict.fromkeys(run.method for run in found.runs))}"
+        raise InputError("--methods", rule, ", ".join(a.methods), "Enter METHOD or METHOD/SEED.")
     return chosen
 
 
 def _take(run: Run, label: str, positions: bool) -> SplatRun:
     if run.trajectory is None or not len(run.trajectory.positions):
         if positions or run.twin is None:
-            raise InputError(f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Name another run.")
+            raise InputError(
+                f"--methods {run.name}", "must have a prediction", "; ".join(run.notes) or "none", "Select other runs."
+            )
         return SplatRun(label, run.twin.topology.nodes[None], run.twin)
     return SplatRun(label, run.trajectory.positions, run.twin, run.splats, None if run.centers is None else run.centers.positions)
 
@@ -164,31 +166,31 @@ def _take(run: Run, label: str, positions: bool) -> SplatRun:
 def _frames(wanted: Sequence[int] | None, count: int, option: str = "--frames") -> list[int]:
     beyond = [frame for frame in wanted or () if not 0 <= frame < count]
     if beyond:
-        raise InputError(option, f"the scenario has the frames 0 to {count - 1}", ", ".join(map(str, beyond)))
+        raise InputError(option, f"must be 0 to {count - 1}, the frames of the scenario", ", ".join(map(str, beyond)))
     return list(wanted or ())
 
 
 def _without_splats(chosen: Chosen, required: bool, remedy: str = "") -> str:
-    """The runs that have no splats, and why where that is known; empty if all have some. Raises InputError if `required`."""
+    """The runs without splats, with known reasons; empty if all runs have splats. Raises InputError if they are `required`."""
     without = "; ".join(", ".join([run.name, *run.notes]) for run in chosen.runs if run.splats is None)
     if required and without:
-        rule = f"needs {chosen.found.folder / 'appearance'}/<seed>/splats.ply, of a scenario with images"
+        rule = f"requires {chosen.found.folder / 'appearance'}/<seed>/splats.ply of a scenario with images"
         raise InputError("--as splats", rule, f"none for {without}", remedy)
     return without
 
 
 def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error | None) -> PhotoPainter:
-    """The painter of a strip or a film; `error` is drawn where the options ask for none, None stands for the best there is."""
-    without = _without_splats(chosen, a.style == "splats", "Leave out --as splats to draw nodes.")
+    """The painter of a strip or video; `error` replaces --error best, and None selects the best that can be drawn."""
+    without = _without_splats(chosen, a.style == "splats", "Remove --as splats to draw nodes.")
     style = a.style or ("nodes" if without else "splats")
     if without and a.style is None and chosen.found.capture is not None:
-        print(f"Nodes are drawn, since there are no splats for {without}")
+        print(f"Drawing nodes, because there are no splats for {without}")
     scene = _scene(a, chosen, frames, chosen.takes)
     comparable = style == "splats" and scene.has_masks
     if a.error == "color" and not comparable:
-        what = "nodes" if style == "nodes" else f"camera {scene.camera.name} without photos or masks"
-        rule = "needs splats, and photos with masks of the same camera"
-        raise InputError("--error color", rule, what, "Take --error distance.")
+        received = "nodes" if style == "nodes" else f"camera {scene.camera.name} without photos or masks"
+        rule = "requires splats, and photos with masks of the same camera"
+        raise InputError("--error color", rule, received, "Use --error distance.")
     require_between("--most", 1.0 if a.most is None else a.most, 1e-6, 1e6)
     manner = PhotoStyle(
         style=style,
@@ -199,16 +201,16 @@ def _painter(a: ComparedOptions, chosen: Chosen, frames: list[int], error: Error
 
 
 def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[SplatRun]) -> FilmedScene:
-    """The scene from the camera that is asked for. Raises InputError."""
+    """The scene from the selected camera or view. Raises InputError."""
     found, observations = chosen.found, chosen.found.observations
     cameras = found.capture.cameras if found.capture else {}
-    turned = a.azimuth is not None or a.elevation is not None
-    if a.camera is not None and turned:
-        raise InputError("--camera", "excludes --azimuth and --elevation", a.camera, "Give one or the other.")
+    free_view = a.azimuth is not None or a.elevation is not None
+    if a.camera is not None and free_view:
+        raise InputError("--camera", "cannot be combined with --azimuth and --elevation", a.camera, "Remove one of them.")
     if a.camera is not None and a.camera not in cameras:
-        rule = f"must be a camera of the capture: {', '.join(cameras) or 'there is none'}"
-        raise InputError("--camera", rule, a.camera, "Give --azimuth and --elevation for any other view.")
-    if cameras and not turned:
+        rule = f"must be a camera of the capture ({', '.join(cameras) or 'it has none'})"
+        raise InputError("--camera", rule, a.camera, "Use --azimuth and --elevation for other views.")
+    if cameras and not free_view:
         camera = cameras[a.camera or next(iter(cameras))]
         return FilmedScene.of(observations, camera, takes, frames, found.capture, _labels(found.folder, found.capture, camera))
     elevation = VIEW_ELEVATION if a.elevation is None else a.elevation
@@ -216,12 +218,12 @@ def _scene(a: RunOptions, chosen: Chosen, frames: list[int], takes: list[SplatRu
 
 
 def _labels(folder: Path, capture: Capture | None, camera: Camera) -> np.ndarray | None:
-    """The camera's perceived masks [T, H, W], where the capture has none of its own and they were found."""
+    """Perceived masks [T, H, W] of the camera; None if the capture provides masks or segmentation has no result."""
     path = folder / "perception" / camera.name / "masks.json"
     if capture is None or capture.description.masks or not path.is_file():
         return None
     labels = Masks.load(StageRecord.load(path).file("masks", path)).labels
     shape = (capture.frame_count, camera.height, camera.width)
     if labels.shape != shape:
-        raise InputError(path, f"masks must have the frames and size of camera {camera.name}: {shape}", labels.shape)
+        raise InputError(path, f"masks must have the shape of camera {camera.name}, {shape}", labels.shape)
     return labels

@@ -1,4 +1,4 @@
-"""Runs on the video: photos behind drawings, predictions as splats beside them, differences of colors, surfaces of twins."""
+"""Drawing of runs with the capture's images: nodes over photos, splats, color differences, and surfaces of twins."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ Style = Literal["splats", "nodes"]
 
 @dataclass(frozen=True, eq=False)
 class SplatRun(ShownRun):
-    """A run's prediction with its splats, where it has some."""
+    """The prediction of a run with its splats, if any."""
 
     splats: Splats | None = None
     centers: np.ndarray | None = None
-    """Centers [F, G, 3], m, at which the method's own model puts its splats; else the nodes carry them."""
+    """Centers [F, G, 3], m, of the splats, predicted by the method itself; None: the nodes carry the splats."""
 
     def gaussians(self, frames: Iterable[int], device: str) -> Iterator[tuple[int, Gaussians]]:
-        """The splats in these frames, in rising order; frames behind a divergence are left out."""
+        """Yield the splats of these frames in ascending order; frames after a divergence are skipped."""
         assert self.splats is not None
-        wanted = {frame for frame in frames if frame < len(self.positions)}
-        stop = max(wanted, default=-1) + 1
+        selected = {frame for frame in frames if frame < len(self.positions)}
+        stop = max(selected, default=-1) + 1
         if self.centers is None:
             every = skinned_frames(self.splats, self.positions[:stop], device) if stop else iter(())
         else:
             every = frames_from_centers(self.splats, self.centers[:stop], device)
-        return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in wanted)
+        return ((frame, gaussians) for frame, gaussians in enumerate(every) if frame in selected)
 
 
 @dataclass(frozen=True, eq=False)
 class FilmedScene(ShownScene):
-    """The observed scene with the video of a camera of the capture, where it is one of its."""
+    """The observed scene with images and masks, if the camera is a camera of the capture."""
 
     capture: Capture | None = None
     labels: np.ndarray | None = None
-    """Perceived masks [T, H, W] of the camera, where the capture has none of its own."""
+    """Perceived masks [T, H, W] of the camera, if the capture does not provide masks."""
 
     @classmethod
     def of(
@@ -65,7 +65,7 @@ class FilmedScene(ShownScene):
         capture: Capture | None = None,
         labels: np.ndarray | None = None,
     ) -> FilmedScene:
-        """The part of the picture that holds what these frames show."""
+        """The scene, cut to the part of the camera's image with all content of these frames."""
         pixels, depth = camera.project(shown_points(observations, takes, frames))
         seen, last = pixels[depth > 0], [camera.width - 1, camera.height - 1]
         seen = seen if len(seen) else np.array([[0.0, 0.0], last])
@@ -73,18 +73,18 @@ class FilmedScene(ShownScene):
         return cls(observations, camera, box_around(seen, camera, clip=capture is not None), capture, labels)
 
     def cut(self, picture: np.ndarray) -> np.ndarray:
-        """The shown part of a picture [H, W, ...]."""
+        """The shown part of an image [H, W, ...]."""
         left, top, right, bottom = self.box
         return picture[top:bottom, left:right]
 
     def photo(self, frame: int) -> np.ndarray | None:
-        """RGB [H, W, 3] uint8 of the whole picture; None: there is none."""
+        """The whole photo of a frame, RGB [H, W, 3] uint8; None if there is none."""
         if self.capture is None or not self.capture.has(self.camera.name, frame):
             return None
         return self.capture.color(self.camera.name, frame)
 
     def mask(self, frame: int) -> np.ndarray | None:
-        """Labels [H, W] of the whole picture; None: there are none."""
+        """Labels [H, W] of the whole photo of a frame; None if there are none."""
         if self.capture is None or not self.capture.has(self.camera.name, frame):
             return None
         if self.capture.description.masks:
@@ -93,32 +93,32 @@ class FilmedScene(ShownScene):
 
     @property
     def has_masks(self) -> bool:
-        """True where observed and predicted pictures can be compared."""
+        """True if the scene has masks, so that observed and predicted images can be compared."""
         return self.capture is not None and (self.capture.description.masks or self.labels is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A prediction as splats in one frame, the shown part of the picture."""
+    """A prediction as splats in one frame, cut to the shown part of the image."""
 
     rgba: np.ndarray
-    """[h, w, 4] uint8, over black."""
+    """Splats [h, w, 4] uint8, over black."""
     difference: np.ndarray | None = None
-    """Mean absolute color difference [h, w], of 1; NaN where neither shows the object; None: nothing to compare with."""
+    """Mean absolute color difference [h, w] of colors 0 to 1; NaN where neither image shows the object; None: no comparison."""
     hands: np.ndarray | None = None
     psnr: float = float("nan")
-    """PSNR of the whole picture, as in the tables, dB."""
+    """PSNR of the whole image, dB, as in the tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoStyle(DrawingStyle):
-    """Style in which predictions are drawn: splats on white beside the masked photo, or nodes on the pale photo."""
+    """Style in which predictions are drawn: splats on white, or nodes over a pale photo."""
 
     style: Style
 
 
 class PhotoPainter(Painter):
-    """Paints photos, predictions as splats or as nodes on the photo, and differences of colors."""
+    """Draws photos, predictions as splats or as nodes over the photo, and color differences."""
 
     scene: FilmedScene
     manner: PhotoStyle
@@ -152,7 +152,7 @@ class PhotoPainter(Painter):
         return Drawn(cut(rgba), part, cut(pair.hands), float(psnr(pair.prediction, pair.truth)))
 
     def draw_observed(self, axis: Axes, frame: int) -> None:
-        """The photo, or the observed points where the camera has none."""
+        """Draw the photo, or the observed points if there is no photo."""
         photo, labels = self.scene.photo(frame), self.scene.mask(frame)
         if photo is not None:
             empty(axis, self.scene.view)
@@ -160,10 +160,10 @@ class PhotoPainter(Painter):
             return
         super().draw_observed(axis, frame)
         if self.scene.capture is not None:
-            self._note(axis, f"camera {self.scene.camera.name} missed it")
+            self._note(axis, f"camera {self.scene.camera.name}: no image")
 
     def draw_predicted(self, axis: Axes, which: int, frame: int) -> None:
-        """The prediction as splats, or as nodes; nodes stand on a pale photo, or before the observed points."""
+        """Draw the prediction as splats, or as nodes over a pale photo or the observed points."""
         if self.manner.style == "nodes" or frame >= len(self.takes[which].positions):
             super().draw_predicted(axis, which, frame)
             return
@@ -171,7 +171,7 @@ class PhotoPainter(Painter):
         self._image(axis, over_white(self._drawn[which][frame].rgba), cut=False)
 
     def draw_error(self, axis: Axes, which: int, frame: int) -> None:
-        """The error in false colors, and its mean: PSNR of pictures, or the mean distance."""
+        """Draw the error in false colors, and write the PSNR or the mean distance."""
         if self.manner.error != "color":
             super().draw_error(axis, which, frame)
             return
@@ -187,7 +187,7 @@ class PhotoPainter(Painter):
 
     def _difference(self, axis: Axes, drawn: Drawn) -> None:
         if drawn.difference is None or drawn.hands is None:
-            self._note(axis, "no picture")
+            self._note(axis, "no image")
             return
         ground = np.full((*drawn.hands.shape, 3), 255, np.uint8)
         ground[drawn.hands] = 200
@@ -207,13 +207,13 @@ def _extent(shape: Sequence[int]) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePicture(TwinPicture):
-    """Twins as springs, or as the surface that their splats show."""
+    """Twins as springs, or as the surface of their splats."""
 
     style: Literal["springs", "splats"] = "springs"
     device: str = "cpu"
 
     def paint(self, axis: Axes, scene: ShownScene, take: ShownRun, quantity: Quantity) -> None:
-        """One panel."""
+        """Draw one panel."""
         if self.style == "springs":
             super().paint(axis, scene, take, quantity)
             return
@@ -225,46 +225,46 @@ class SurfacePicture(TwinPicture):
         hands(axis, scene, self.frame)
 
     def _surface(self, scene: FilmedScene, take: SplatRun, quantity: Quantity) -> np.ndarray:
-        """The splats [h, w, 4] over black, each in the color of the surface node that is nearest in frame 0."""
+        """The splats [h, w, 4] over black, each with the color of the surface node nearest in frame 0."""
         assert take.splats is not None
         outer = take.positions[0][: scene.observations.surface_count]
         nearest = cKDTree(outer).query(take.splats.means)[1]
         rgb = self.node_colors(take, quantity)[nearest, :3]
-        (gaussians,) = (found for _, found in take.gaussians([self.frame], self.device))
+        (gaussians,) = (splats for _, splats in take.gaussians([self.frame], self.device))
         plain = torch.tensor((rgb - 0.5) / C0, dtype=torch.float32, device=self.device)[:, None]
         painted = replace(gaussians, harmonics=plain)
-        # Nothing is compared with it, so it need not have the camera's pixels.
+        # The image is not compared with a photo, so it may have more pixels than the camera.
         view = view_of(finer(scene.view, 900), self.device)
         return picture(painted, view, choose_backend("auto", self.device))
 
 
 def finer(camera: Camera, least: int) -> Camera:
-    """The same view in more pixels, at least `least` wide; pixel centers stay at whole coordinates."""
+    """The same view with more pixels, at least `least` wide; pixel centers remain at integer coordinates."""
     factor = max(math.ceil(least / camera.width), 1)
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2] *= factor
-    # Half a pixel of the border belongs to the outer pixels, whatever their size.
+    # The image extends by half a pixel beyond the outer pixel centers, before and after scaling.
     intrinsics[:2, 2] += 0.5 * (factor - 1)
     return replace(camera, width=factor * camera.width, height=factor * camera.height, intrinsics=intrinsics)
 
 
 FADE = 0.6
-"""Part of white in a photo behind a drawing."""
+"""Fraction of white in a photo behind nodes."""
 
 
 def over_white(rgba: np.ndarray) -> np.ndarray:
-    """RGB [H, W, 3] uint8 of a picture drawn over black [H, W, 4], laid over white."""
+    """Composite an image rendered over black [H, W, 4] onto white: RGB [H, W, 3] uint8."""
     return np.asarray(np.clip(rgba[..., :3] + (255.0 - rgba[..., 3:]) + 0.5, 0, 255), np.uint8)
 
 
 def masked(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The photo with white where there is neither the object nor a hand."""
+    """The photo with white outside of object and hands."""
     picture = photo.copy()
     picture[~np.isin(labels, (OBJECT, HANDS))] = 255
     return picture
 
 
 def faded(photo: np.ndarray) -> np.ndarray:
-    """A photo that a drawing can be read on: gray, and mostly white."""
+    """A pale gray photo as background of nodes."""
     gray = photo.astype(float).mean(axis=2, keepdims=True)
     return np.asarray(np.repeat((1 - FADE) * gray + FADE * 255, 3, axis=2), np.uint8)

@@ -1,6 +1,7 @@
 """From cameras to a capture folder: `neuspring make-capture` and `neuspring cut-capture`.
 
-- `rig`: what the user states (rig.json), other programs' keys, and lenses. `streams`: which images belong together.
-- `formats`: a file for each form of images: folder, video, ROS bag, PhysTwin's raw layout. `poses`: of cameras.
-- `make`: all of it. `cut`: some frames of a capture. `commands`, `options`: the command line.
+- `rig`: rig.json, keys of other programs, and lenses. `poses`: poses of the cameras.
+- `streams`: image streams, and which images belong together.
+- `formats`: one file per input format: image folder, video, ROS bag, PhysTwin's raw layout.
+- `make`: writes a capture. `cut`: copies some frames of a capture. `commands`, `options`: the command line.
 """

@@ -11,8 +11,8 @@ from neuspring.extensions.make_capture.options import Intake
 
 
 def make_capture(intake: Intake) -> int:
-    """Color and depth of cameras, or points in space -> a capture folder, checked as `check-data` checks it; exit status 2 means
-    that a check found an error."""
+    """Write a capture folder from color and depth of cameras, or from points in space, and run the checks of `check-data`; exit
+    status 2 means that a check found an error."""
     from neuspring.extensions.make_capture.make import make_capture as make
     from neuspring.intake.check import check_capture, render
 
@@ -37,15 +37,15 @@ def make_capture(intake: Intake) -> int:
 
 def cut_capture(
     capture: Annotated[Positional[Path], arg(help="capture folder")],
-    frames: Annotated[str, arg(help="first and last frame that are kept, like 12-97")],
+    frames: Annotated[str, arg(help="first and last frame to keep, like 12-97")],
     output: Annotated[Path, arg(help="the capture folder to write")],
 ) -> None:
-    """Some frames of a capture, with their masks and tracks -> another capture; annotations of masks stay behind."""
+    """Copy some frames of a capture, with masks and tracks, to a new capture; annotations of masks are not copied."""
     from neuspring.data.capture import Capture
     from neuspring.extensions.make_capture.cut import cut
 
     first, _, last = frames.partition("-")
     if not (first.isdigit() and last.isdigit()):
-        raise InputError("--frames", "a first and a last frame are required, as in 12-97", frames)
+        raise InputError("--frames", "a first and a last frame are required, like 12-97", frames)
     made = cut(Capture.load(capture), int(first), int(last), output)
     print(f"written: {made.folder}, {made.frame_count} frames\nnext:\n  neuspring check-data {made.folder}")

@@ -1,4 +1,4 @@
-"""From the streams of cameras, or points in space, to a capture folder; an interrupted call resumes."""
+"""Write a capture folder from streams of cameras or from points in space; an interrupted call resumes."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from neuspring.intake import points
 OF_FILM = ("color", "depth", "recording", "rig", "frames", "shift", "pose", "pair")
 """Options that only concern cameras."""
 FEW_FRAMES = 5
-"""Frames of a camera in which the table or a board is looked for."""
+"""Number of frames of a camera in which the table or a board is searched."""
 RATE_APART = 0.02
-"""Stated frame rates may differ by this fraction from that of the stamps."""
+"""Largest relative difference of a stated frame rate from that of the stamps."""
 PRECIOUS = ("mask", "marks.json", "annotations.json", TRACKS, POINTS, *capture.CONTROLLERS, *capture.NODES, capture.REST)
-"""Work of people and of hours, which --force does not remove."""
+"""Files that took people or programs hours; --force does not remove them."""
 
 
 def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
-    """Write the capture; returns it with a report of what was found.
+    """Write the capture, and return it with a report.
 
-    All is checked before the first image is written. An interrupted call resumes. Raises InputError naming the option or file, the
-    rule, what was received and the next move.
+    All input is checked before the first image is written. An interrupted call resumes. Raises InputError with the option or file,
+    the rule, the received value and the next move.
     """
     for option, value in (("--output", intake.output != Path()), ("--category", intake.category)):
         if not value:
-            raise InputError(option, "is required", "none", "neuspring make-capture --help has all options.")
+            raise InputError(option, "is required", "none", "Run neuspring make-capture --help for all options.")
     require_free(intake.output, intake.force)
     if bool(intake.color) == bool(intake.recording):
         if intake.color or not intake.controllers:
@@ -60,7 +60,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
             raise InputError("make-capture", rule, "both" if intake.color else "none")
         return _of_points(intake)
     if intake.plumb:
-        raise InputError("--plumb", "is for points in space without color", "cameras", "State the pose of the table in rig.json.")
+        raise InputError("--plumb", "is only for points without color", "cameras", "State the pose of the table in rig.json.")
     rig = read_rig(intake.rig)
     if intake.recording:
         opened = open_recording(intake)
@@ -70,7 +70,7 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
         opened = open_streams(intake)
     names = [rig.cameras[k].name or str(k) if k < len(rig.cameras) else str(k) for k in range(len(opened))]
     if len(set(names)) < len(names) or len(rig.cameras) > len(names):
-        rule = f"cameras: one entry for each of the {len(names)} cameras is required, with names that differ"
+        rule = f"cameras: one entry with its own name is required for each of the {len(names)} cameras"
         raise InputError(intake.rig, rule, f"{len(rig.cameras)} entries, {' '.join(names)}")
     late = shifts(intake.shift, opened, names)
     views = [
@@ -94,13 +94,13 @@ def make_capture(intake: Intake) -> tuple[Capture, list[str]]:
     alone = {view.name: view.without_partner for view in views if view.without_partner}
     lines = [f"frames: {choice.text()}; {rate:g} frames per second", f"poses: {placed.how}, up {placed.up}"]
     lines += [f"depth: {unit:g} m per count"] if unit else []
-    lines += [f"warning: camera {name} misses {count} frames that others have" for name, count in missing.items()]
+    lines += [f"warning: camera {name} misses {count} frames of other cameras" for name, count in missing.items()]
     lines += [f"warning: camera {name}: {count} images without a partner are left out" for name, count in alone.items()]
     return Capture.load(intake.output), lines
 
 
 def shifts(given: Sequence[str], views: Sequence[CameraStreams], names: Sequence[str]) -> dict[str, int]:
-    """Images by which streams are late, by name, from options such as `0.depth=1`. Raises InputError."""
+    """Stream -> number of images by which it is late, from options such as `0.depth=1`. Raises InputError."""
     known = [*(f"{name}.depth" for name, view in zip(names, views, strict=True) if view.depth is not None), *names[1:]]
     late = {}
     for text in given:
@@ -112,7 +112,7 @@ def shifts(given: Sequence[str], views: Sequence[CameraStreams], names: Sequence
 
 
 def rate_of(path: Path | None, rig: StatedRig, views: Sequence[CameraStreams], step: int) -> float:
-    """Frames per second of the capture: the stated rate, or that of the stamps, over `step`. Raises InputError."""
+    """Frames per second of the capture: the stated rate, or that of the stamps, divided by `step`. Raises InputError."""
     value = stated(path, "frame_rate", rig.frame_rate)
     known = [rate for view in views if (rate := view.color.series.rate) is not None]
     if value == "stamps":
@@ -122,28 +122,28 @@ def rate_of(path: Path | None, rig: StatedRig, views: Sequence[CameraStreams], s
         return round(known[0], 2) / step
     for rate in known:
         if abs(rate - value) > RATE_APART * value:
-            remedy = 'Correct it, or state "stamps".'
-            raise InputError(path, "frame_rate: must be that of the stamps", f"{value:g}, and {rate:.4g} by stamps", remedy)
+            remedy = 'Correct the rate, or state "stamps".'
+            raise InputError(path, "frame_rate: must be the rate of the stamps", f"{value:g}, and {rate:.4g} by stamps", remedy)
     return float(value) / step
 
 
 def unit_of(path: Path | None, rig: StatedRig, views: Sequence[CameraStreams]) -> float | None:
-    """Meters per count of depth: of the recording or as stated; None without depth. Raises InputError."""
+    """Meters per count of depth, from the recording or rig.json; None without depth. Raises InputError."""
     if all(view.depth is None for view in views):
         return None
     if any(view.depth is None for view in views):
-        raise InputError("--depth", "is required for each camera, or for none", "some")
+        raise InputError("--depth", "is required for all cameras or for none", "some")
     known = {view.unit for view in views if view.unit is not None}
     if known and (len(known) > 1 or rig.depth_unit not in (None, *known)):
         received = " and ".join(map(str, sorted(known))) + f"; stated {rig.depth_unit}"
-        raise InputError(path or "--recording", "depth_unit: must be that of the recording, one for all cameras", received)
+        raise InputError(path or "--recording", "depth_unit: must be that of the recording, the same for all cameras", received)
     return known.pop() if known else float(stated(path, "depth_unit", rig.depth_unit))
 
 
 def look(
     path: Path | None, entry: RigCamera, view: CameraStreams, choice: FrameChoice, unit: float | None, board: bool
 ) -> SeenCamera:
-    """A few of the chosen frames of a camera without distortion; with `board` the first ones of the source. Raises InputError."""
+    """A few undistorted frames of a camera: chosen frames, or with `board` the first ones of the source. Raises InputError."""
     places = [place for _, place in sorted(choice.places[view.name].items())]
     some = sorted({places[k] for k in np.linspace(0, len(places) - 1, FEW_FRAMES).astype(int)})
     pairs = list(view.read(range(min(FEW_FRAMES, len(view.pairs))) if board else some))
@@ -155,7 +155,7 @@ def look(
 
 
 def plain(depth: np.ndarray) -> np.ndarray:
-    """16-bit counts as they are; other numbers as float32, 0 where there is no depth."""
+    """Depth with 16-bit counts unchanged, and other numbers as float32, 0 where there is no depth."""
     return depth if depth.dtype == np.uint16 else np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(0)
 
 
@@ -168,7 +168,7 @@ def _described(
     seen: Mapping[str, SeenCamera],
     placed: Placed,
 ) -> Description:
-    """capture.json. Raises InputError."""
+    """The content of capture.json. Raises InputError."""
     cameras = []
     for name, view in seen.items():
         entry = Camera(name, *view.size, view.lens.matrix, placed.poses[name]).entry()
@@ -204,9 +204,9 @@ def _parsed(intake: Intake, **entries: Any) -> Description:
 
 @contextmanager
 def _begun(intake: Intake, made: Description, seen: Mapping[str, SeenCamera]) -> Iterator[tuple[Writer, bool]]:
-    """A writer of the images, True where the folder holds a part of them already; the points of a user follow the images.
+    """Yield a writer for the images, and whether the folder contains some of them already; then write points in space.
 
-    Raises InputError, before anything is written, for points of which no twin can be made.
+    Raises InputError, before anything is written, for points that cannot make a twin.
     """
     folder = intake.output
     space, findings = points.look(Capture(folder, made), intake.brought)
@@ -232,22 +232,22 @@ def _write(
     unit: float | None,
     seen: Mapping[str, SeenCamera],
 ) -> None:
-    """The images that are not there yet."""
+    """Write the images that do not exist yet."""
     made, done = writer.capture.description, 0
     kinds: tuple[Literal["color", "depth"], ...] = ("color", "depth") if unit else ("color",)
     progress = Progress(f"make-capture {made.name}", sum(len(places) for places in choice.places.values()))
     for view in views:
         straight, places = seen[view.name].straight, dict(sorted(choice.places[view.name].items()))
         if begun:
-            there = [f for f in places if all(writer.capture.path(kind, view.name, f).is_file() for kind in kinds)]
-            done += len(there[:-1])  # the last may be half written
-            places = {frame: place for frame, place in places.items() if frame not in there[:-1]}
+            written = [f for f in places if all(writer.capture.path(kind, view.name, f).is_file() for kind in kinds)]
+            done += len(written[:-1])  # The last image may be incomplete.
+            places = {frame: place for frame, place in places.items() if frame not in written[:-1]}
         for frame, (color, depth) in zip(places, view.read(list(places.values())), strict=True):
             stored = None
             if depth is not None and unit is not None:
                 stored = straight.depth(plain(depth))
                 if (stored.dtype == np.uint16) != (made.depth_format == "png"):
-                    raise InputError(view.path, "depth images must be of one kind, 16-bit integers or other numbers", "both")
+                    raise InputError(view.path, "all depth images must be 16-bit integers, or none of them", "both")
                 stored = stored if made.depth_format == "png" else (stored * unit).astype(np.float32)
             writer.frame(view.name, frame, straight.color(color), stored)
             done += 1
@@ -255,24 +255,26 @@ def _write(
 
 
 def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
-    """A capture of points in space, without cameras."""
+    """Write a capture of points in space, without cameras."""
     brought = intake.brought
     if missing := [f"--{name}" for name in ("controllers", "nodes", "tracks") if name not in brought]:
         raise InputError("make-capture", "points without color need --controllers, --nodes and --tracks", f"no {' '.join(missing)}")
     if given := [f"--{name}" for name in OF_FILM if getattr(intake, name)]:
-        raise InputError(given[0], "is for cameras, and there is no --color", "points", "Leave it out: a row is a frame.")
+        raise InputError(given[0], "requires --color or --recording", "points", "Remove the option: each row is a frame.")
     if intake.up is None:
-        raise InputError("--up", "is required for points in space", "none", "State the axis that points up, --up +z or --up -z.")
+        raise InputError("--up", "is required for points in space", "none", "State the axis that points up: --up +z or --up -z.")
     read = {path: Markers.read(path) for path in brought.values() if is_c3d(path)}
     known = {one.rate for one in read.values()}
     if len({one.first for one in read.values()}) > 1:
         firsts = ", ".join(f"{path.name} {one.first}" for path, one in read.items())
-        rule = "C3D files of one capture must begin at one frame of their take"
-        raise InputError("make-capture", rule, firsts, "Export the same frames of all.")
+        rule = "all C3D files of a capture must begin at the same frame of the recording"
+        raise InputError("make-capture", rule, firsts, "Export the same frames for all files.")
     rate = intake.rate or (known.pop() if len(known) == 1 else None)
     if rate is None or (known and known != {rate}):
         received = " and ".join(f"{one:g}" for one in sorted(known)) or "none"
-        raise InputError("--rate", "rows per second are required, one rate for all files", received, "State it, --rate 120.")
+        raise InputError(
+            "--rate", "rows per second are required, one rate for all files", received, "State the rate, like --rate 120."
+        )
     frames = len(points.read_hands(brought["controllers"]).points)
     made = _parsed(
         intake,
@@ -291,29 +293,29 @@ def _of_points(intake: Intake) -> tuple[Capture, list[str]]:
 
 
 def digests(files: Mapping[str, Path | None]) -> dict[str, str]:
-    """Digests of files that a user brings, for the provenance."""
+    """Digests of the user's files, for the provenance."""
     return {f"{name} file": f"sha256:{digest_file(plain_file(path))}" for name, path in files.items() if path is not None}
 
 
 def require_free(folder: Path, force: bool) -> None:
-    """Raise InputError for an output folder in which nothing may be written, whatever the input is."""
+    """Raise InputError if `folder` contains files that must not be overwritten."""
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "--output must be a folder", "a file")
     made, begun = (folder / CAPTURE).exists(), (folder / capture.RECIPE).exists()
     if not folder.is_dir() or not any(folder.iterdir()) or (begun and not made):
         return
     if not (force and made):
-        remedy = "Choose another folder" + (", or give --force, which replaces its images." if made else ".")
+        remedy = "Choose another folder" + (", or add --force to replace its images." if made else ".")
         raise InputError(folder, "--output must be a new or empty folder", "a capture" if made else "other files", remedy)
     if kept := [name for name in PRECIOUS if (folder / name).exists()]:
         rule = "--force does not remove masks, annotations or tracks"
-        raise InputError(folder, rule, " and ".join(kept), "Move them away first.")
+        raise InputError(folder, rule, " and ".join(kept), "Move these files first.")
 
 
 def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
-    """Make `folder` ready for a capture made by `recipe`; returns whether it holds a part of it already.
+    """Prepare `folder` for a capture with `recipe`; returns True if it contains an unfinished capture with the same recipe.
 
-    Raises InputError for a folder with anything else in it, unless `force` replaces the images of a capture.
+    Raises InputError for a folder with other files, unless `force` replaces the images of a capture.
     """
     path = folder / capture.RECIPE
     require_free(folder, force)
@@ -321,10 +323,10 @@ def prepare(folder: Path, recipe: dict[str, Any], force: bool) -> bool:
         if load_json(path) == json.loads(json.dumps(recipe)):
             return True
         if not force:
-            remedy = "Choose another folder, or give --force, which replaces its images."
+            remedy = "Choose another folder, or add --force to replace its images."
             raise InputError(folder, "--output must be a new or empty folder", "an unfinished capture from other input", remedy)
     if folder.is_dir() and any(folder.iterdir()):
-        write_text(path, "{}\n")  # An empty record, so that an interrupted run is not mistaken for a part of the new capture.
+        write_text(path, "{}\n")  # An empty recipe: after an interruption, the old images do not count as part of the new capture.
         (folder / CAPTURE).unlink(missing_ok=True)
         for kind in ("color", "depth"):
             shutil.rmtree(folder / kind, ignore_errors=True)

@@ -1,6 +1,6 @@
-"""Poses of the cameras: stated ones, by a ChArUco board, or by the table, which becomes z = 0.
+"""Poses of the cameras: stated, measured with a ChArUco board, or measured with the table, which becomes z = 0.
 
-A board's coordinates become the world: x along its rows, z up out of its printed side, the origin at its corner.
+The coordinates of a board become the world: x along its rows, z out of its printed side, the origin at its corner.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from neuspring.extensions.make_capture.rig import BoardEntry, StatedRig, Straigh
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 TABLE_SHARE, ROUGH = 0.1, 0.02
-"""Least share of the pixels with depth, and largest rms distance, m, of a plane that may be the table."""
+"""Smallest fraction of the pixels with depth, and largest rms distance, m, of a plane that may be the table."""
 FRONTAL = 78.0
-"""Degrees: a plane at which a camera looks down more steeply may be a wall; `table_at` states that it is the table."""
+"""Degrees. A plane that the camera sees at a steeper angle may be a wall, unless `table_at` states that it is the table."""
 FEWEST_CORNERS, MOST_ERROR = 6, 1.5
-"""Corners of a board that give a pose, and their largest error, pixels rms."""
+"""Fewest corners of a board that give a pose, and their largest error, pixels rms."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenCamera:
-    """A few frames of a camera, without distortion."""
+    """A few undistorted frames of a camera."""
 
     name: str
     path: Path
@@ -55,9 +55,9 @@ class Placed:
     """Camera to world [4, 4], m."""
     up: str = "+z"
     how: str
-    """Origin of the poses, in words."""
+    """Origin of the poses, as text."""
     motion: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """[4, 4]: from the stated world to this one."""
+    """Rigid motion [4, 4] from the stated world to this one."""
 
 
 def place(path: Path | None, rig: StatedRig, seen: Mapping[str, SeenCamera]) -> Placed:
@@ -96,32 +96,34 @@ def place(path: Path | None, rig: StatedRig, seen: Mapping[str, SeenCamera]) -> 
 
 
 def find_table(where: object, points: np.ndarray, at: np.ndarray | None = None) -> Plane:
-    """The table among the planes in points [n, 3], m, in the coordinates of a camera: the largest that may be one.
+    """The largest plane in points [n, 3], m, in camera coordinates, that may be the table.
 
-    `at` [3] is a point of the table. Raises InputError where no plane may be the table, with the reason for the largest.
+    `at` [3] is a known point of the table. Raises InputError, with the reason for the largest plane, if none may be the table.
     """
-    found = planes(points)
+    candidates = planes(points)
     if at is not None:
-        found = sorted(found, key=lambda plane: abs(plane.above(at)))[:1]
+        candidates = sorted(candidates, key=lambda plane: abs(plane.above(at)))[:1]
     reasons = []
-    for plane in found:
+    for plane in candidates:
         roll = float(np.degrees(np.arctan2(abs(plane.normal[0]), -plane.normal[1])))
         if at is None and plane.elevation > FRONTAL:
-            reasons.append("it faces the camera: a wall, or a table seen from above; state a pixel of the table, table_at: [x, y]")
+            reasons.append(
+                "it faces the camera: a wall, or a table seen from above; state a pixel of the table as table_at: [x, y]"
+            )
         elif at is None and roll > ROLL:
             reasons.append(f"its normal leans {roll:.0f} degrees from the upward direction of the image: a wall or a ceiling")
         elif plane.share < TABLE_SHARE or plane.rms > ROUGH:
             reasons.append(f"a table has at least {TABLE_SHARE:.0%} of the pixels with depth and at most {1e3 * ROUGH:g} mm rms")
         else:
             return plane
-    received = f"{found[0].text()}: {reasons[0]}" if found else "no plane in depth"
-    raise InputError(where, "the table must be seen", received, "Film the table from above its edge, or state the poses.")
+    received = f"{candidates[0].text()}: {reasons[0]}" if candidates else "no plane in depth"
+    raise InputError(where, "the table must be seen", received, "Record the table from above its edge, or state the poses.")
 
 
 def pose_on(table: Plane, points: np.ndarray, view: SeenCamera) -> np.ndarray:
-    """Camera to world [4, 4], m, of a camera that sees `table`: z along its normal, x to the right of the image.
+    """Camera-to-world pose [4, 4], m, of a camera that sees `table`: z along its normal, x to the right of the image.
 
-    The origin lies on the table below the median of the points [n, 3] in the middle third of the image.
+    The origin is on the table, below the median of the points [n, 3] in the middle third of the image.
     """
     up = table.normal
     y = np.cross(up, [1.0, 0.0, 0.0])
@@ -136,7 +138,7 @@ def pose_on(table: Plane, points: np.ndarray, view: SeenCamera) -> np.ndarray:
 
 
 def levelling(tables: Mapping[str, Plane], poses: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The motion [4, 4] of the world that puts the table that all cameras see at z = 0, the cameras above it."""
+    """Rigid motion [4, 4] of the world that moves the table of all cameras to z = 0, below the cameras."""
     points = np.concatenate([plane.points @ poses[name][:3, :3].T + poses[name][:3, 3] for name, plane in tables.items()])
     center = points.mean(axis=0)
     normal = np.linalg.svd((points - center).T @ (points - center))[0][:, -1]
@@ -148,9 +150,10 @@ def levelling(tables: Mapping[str, Plane], poses: Mapping[str, np.ndarray]) -> n
 
 
 def by_board(board: BoardEntry, view: SeenCamera, folder: Path | None) -> tuple[np.ndarray, float]:
-    """The pose of a camera by a board that lies still, and the error, pixels rms: in images of `folder`, else in its own frames.
+    """Measure a camera's pose with a static board, in images of `folder` or in the camera's own frames.
 
-    Raises InputError where too few corners are seen, or they do not fit.
+    Returns the camera-to-world pose [4, 4], m, and the error, pixels rms. Raises InputError if too few corners are seen, or they do
+    not fit.
     """
     if not hasattr(cv2.aruco, board.dictionary) or not board.marker < board.square:
         rule = "board: a dictionary of OpenCV and markers smaller than squares are required"
@@ -174,12 +177,12 @@ def by_board(board: BoardEntry, view: SeenCamera, folder: Path | None) -> tuple[
     where, matrix = folder or view.path, view.lens.matrix
     if len(pixels) < FEWEST_CORNERS:
         rule = f"at least {FEWEST_CORNERS} corners of the board must be seen by camera {view.name}"
-        raise InputError(where, rule, f"{len(pixels)} in {len(images)} images", "Look at `board` of rig.json, and at the light.")
+        raise InputError(where, rule, f"{len(pixels)} in {len(images)} images", "Correct `board` of rig.json, or use more light.")
     _, turn, shift = cv2.solvePnP(points, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
     turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, None, turn, shift)
     projected = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2)
     if (error := float(np.sqrt(np.mean(np.sum((projected - pixels) ** 2, axis=1))))) > MOST_ERROR:
-        remedy = "The board must lie still in all images, and the intrinsics must be those of these images."
+        remedy = "Keep the board still in all images, and state the intrinsics of these images."
         raise InputError(where, f"corners of the board must fit within {MOST_ERROR:g} pixels rms", f"{error:.2f}", remedy)
     board_to_camera = np.eye(4)
     board_to_camera[:3, :3], board_to_camera[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
@@ -187,7 +190,7 @@ def by_board(board: BoardEntry, view: SeenCamera, folder: Path | None) -> tuple[
 
 
 def _point(view: SeenCamera, at: tuple[float, float]) -> np.ndarray:
-    """The point [3], m, in the camera's coordinates, at pixel (x, y): the median of the depth around it. Raises InputError."""
+    """The point [3], m, in camera coordinates, at pixel (x, y), from the median depth around it. Raises InputError."""
     x, y = round(at[0]), round(at[1])
     around = np.stack(view.depths)[:, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
     if not (around > 0).any():

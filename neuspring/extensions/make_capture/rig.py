@@ -1,14 +1,14 @@
-"""rig.json: what a user states about the cameras. Nothing is guessed: a missing key is asked for with an example.
+"""rig.json, the user's description of the cameras. No value is guessed: the error for a missing key contains an example.
 
-frame_rate   frames per second, or "stamps": the rate of the stamps of a video, a bag or stamps.csv
+frame_rate   frames per second, or "stamps": the rate from the stamps of a video, a bag or stamps.csv
 depth_unit   m per count of depth; 1 for meters
 poses        camera_to_world, world_to_camera (both with `pose` of each camera), board, or table (one camera)
-axes         of the cameras of given poses: opencv (x right, y down, z forward) or opengl (x right, y up, z backward)
+axes         camera axes of the given poses: opencv (x right, y down, z forward) or opengl (x right, y up, z backward)
 up           axis of the given world that points up: +z, -z, +y, ...; or table: the world is moved so that the table is z = 0
-table_at     [x, y], optional: a pixel of the table, where another plane is larger
+table_at     optional: [x, y], a pixel of the table, if another plane is larger
 board        {"squares": [5, 7], "square": 0.04, "marker": 0.03, "dictionary": "DICT_5X5_100"}: a ChArUco board, m
-cameras      in the order of --color, of each: name (optional), width, height, fx, fy, cx, cy (pixels), distortion_model (none,
-             opencv, fisheye), distortion (coefficients of OpenCV), pose (4 x 4, m), board_images (optional: a folder)
+cameras      for each camera, in the order of --color: name (optional), width, height, fx, fy, cx, cy (pixels), distortion_model
+             (none, opencv, fisheye), distortion (coefficients of OpenCV), pose (4 x 4, m), board_images (optional: a folder)
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from neuspring.data.capture import intrinsics_findings
 KEYS = (
     ("nerfstudio transforms.json", "fl_x fl_y w h, transform_matrix", "fx fy width height, pose with axes opengl"),
     ("RealSense (librealsense)", "ppx ppy, coeffs, depth_scale", "cx cy, distortion (opencv), depth_unit"),
-    ("Record3D metadata.json", "K (by columns), w h", "fx = K[0], fy = K[4], cx = K[6], cy = K[7], width height, depth_unit 1"),
+    ("Record3D metadata.json", "K (by columns), w h", "fx=K[0] fy=K[4] cx=K[6] cy=K[7], width height, depth_unit 1"),
     (
         "OpenCV",
         "camera_matrix (_3x3), dist_coeffs (_array), rvec tvec",
@@ -41,7 +41,7 @@ KEYS = (
     (
         "ROS camera_info",
         "K D, plumb_bob or equidistant",
-        "fx fy cx cy, distortion with opencv or fisheye; of rectified images P and none",
+        "fx fy cx cy, distortion with opencv or fisheye; rectified: P, none",
     ),
     (
         "Kalibr",
@@ -68,7 +68,7 @@ EXAMPLES = {
 }
 COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "none": (0,)}
 VIEW_DEGREES = (10.0, 150.0)
-"""Degrees. A focal length that gives another field of view is not in pixels of these images."""
+"""Range of the field of view, degrees; focal lengths outside it are not in pixels of the images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ class StatedRig:
 
 
 def read_rig(path: Path | None) -> StatedRig:
-    """The stated facts; none without a file. Raises InputError with the table of other programs' keys."""
+    """Read rig.json; without a file all keys are None. Raises InputError with the table of other programs' keys."""
     if path is None:
         return StatedRig()
     values = load_json(path)
@@ -125,24 +125,24 @@ def read_rig(path: Path | None) -> StatedRig:
             raise InputError(path, "a JSON object is required", type(values).__name__)
         return parse(StatedRig, values, str(path))
     except InputError as error:
-        rows = "".join(f"\n  {program}: {theirs} -> {ours}" for program, theirs, ours in KEYS)
-        told = str(error).partition(". \nSee config")[0]
-        raise InputError(told, f"rig.json has keys of its own ({__name__}). Keys of other programs become{rows}") from error
+        rows = "".join(f"\n  {program}: {keys} -> {rig_keys}" for program, keys, rig_keys in KEYS)
+        cause = str(error).partition(". \nSee config")[0]
+        raise InputError(cause, f"rig.json has its own keys ({__name__}). Keys of other programs become{rows}") from error
 
 
 def stated(path: Path | None, key: str, value: Any, camera: str = "") -> Any:
-    """The value of a key that is required. Raises InputError with an example."""
+    """The value of a required key. Raises InputError with an example if it is None."""
     if value is None:
         where = f"cameras.{camera}.{key}" if camera else key
         example = f"State it, for example {EXAMPLES[key]}." if key in EXAMPLES else "State it in pixels of these images."
-        raise InputError(path or "--rig rig.json", f"{where}: is required, nothing is guessed", "none", example)
+        raise InputError(path or "--rig rig.json", f"{where}: is required", "none", example)
     return value
 
 
 def lens_of(path: Path | None, name: str, entry: RigCamera, source: Lens | None, size: tuple[int, int]) -> Lens:
-    """The lens of a camera with images of `size` (width, height): the stated one, else that of the recording.
+    """The lens of a camera with images of `size` (width, height): from rig.json if stated there, else from the recording.
 
-    Raises InputError where a key is missing, or the lens does not fit the images.
+    Raises InputError if a key is missing or the lens does not fit the images.
     """
     where: object = path or name
     if source is None or entry.fx is not None:
@@ -156,24 +156,24 @@ def lens_of(path: Path | None, name: str, entry: RigCamera, source: Lens | None,
     else:
         lens = source
     if lens.size != size and lens.size is not None:
-        remedy = "State the intrinsics of these images: after a resize, fx, fy, cx and cy scale with the size."
+        remedy = "State the intrinsics of these images; resizing scales fx, fy, cx and cy."
         rule = f"camera {name}: width and height must be those of its images, {size[0]} x {size[1]}"
         raise InputError(where, rule, f"{lens.size[0]} x {lens.size[1]}", remedy)
     refuse(intrinsics_findings(Path(str(where)), f"intrinsics of camera {name}", lens.matrix, size))
     if lens.model not in COEFFICIENTS or len(lens.distortion) not in COEFFICIENTS[lens.model]:
         rule = f"camera {name}: distortion_model must be none, opencv (4, 5, 8, 12 or 14 coefficients) or fisheye (4)"
-        remedy = "Undistort other models with the camera's software, and state the intrinsics of the result with none."
+        remedy = "Undistort other models with the camera's software, and state the new intrinsics with distortion_model none."
         raise InputError(where, rule, f"{lens.model} with {len(lens.distortion)}", remedy)
     views = np.degrees(2 * np.arctan(0.5 * np.array(size) / np.diag(lens.matrix)[:2]))
     if not (VIEW_DEGREES[0] < views.min() and views.max() < VIEW_DEGREES[1]):
         rule = f"camera {name}: a field of view between {VIEW_DEGREES[0]:g} and {VIEW_DEGREES[1]:g} degrees is required"
         received = f"{views[0]:.1f} x {views[1]:.1f} degrees"
-        raise InputError(where, rule, received, "Focal lengths are in pixels of these images, not in millimeters.")
+        raise InputError(where, rule, received, "State focal lengths in pixels of these images, not in millimeters.")
     return lens
 
 
 class Straightener:
-    """Removes the distortion of one camera's images; K stays."""
+    """Removes the distortion of one camera's images; K does not change."""
 
     def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
         self.maps: Any = None
@@ -183,11 +183,11 @@ class Straightener:
             self.maps = module.initUndistortRectifyMap(k, coefficients, np.eye(3), k, size, cv2.CV_32FC1)
 
     def color(self, image: np.ndarray) -> np.ndarray:
-        """Interpolated."""
+        """Undistort color by bilinear interpolation."""
         return self._moved(image, cv2.INTER_LINEAR)
 
     def depth(self, image: np.ndarray) -> np.ndarray:
-        """The nearest value: the mean of two depths is a depth where nothing is."""
+        """Undistort depth by the nearest value; a mean of two depths would be on neither surface."""
         return self._moved(image, cv2.INTER_NEAREST)
 
     def _moved(self, image: np.ndarray, interpolation: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Streams of images, and which images of two streams show the same moment: by stamps, names or order, as the user states."""
+"""Streams of images, and pairing of their images by stamps, names or order."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Pairing = Literal["names", "order"]
 Pair: TypeAlias = tuple[np.ndarray, np.ndarray | None]
 """RGB [H, W, 3] uint8, and depth [H, W] as stored; None: a camera without depth."""
 GAP = 1.5
-"""Intervals this many times the median interval contain a missing image."""
+"""Longer intervals, in median intervals, contain a missing image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Frame numbers and times of the images of a stream, both ascending."""
+    """Frame numbers and times of a stream's images, both ascending."""
 
     numbers: list[int]
     times: np.ndarray | None = None
     """s; None: no stamps."""
     clock: str = ""
-    """Name of the clock of the times; empty: they start with the stream's first image."""
+    """Name of the clock of the times; empty: times start at the stream's first image."""
     named: bool = True
-    """False where the numbers only count the images, and identify no moment."""
+    """False if the numbers only count images and identify no moment."""
 
     @property
     def step(self) -> float:
@@ -43,7 +43,7 @@ class Series:
 
     @property
     def rate(self) -> float | None:
-        """Frames per second: mean over the intervals without a missing image. None without stamps."""
+        """Frames per second, averaged over intervals without a missing image. None without stamps."""
         if self.times is None or len(self.times) < 2:
             return None
         steps = np.diff(self.times)
@@ -51,32 +51,33 @@ class Series:
 
 
 class ImageSource(Protocol):
-    """Images of one kind, in the order of time."""
+    """Images of one kind, in temporal order."""
 
     @property
     def path(self) -> Path:
-        """For messages."""
+        """Path for messages."""
 
     @property
     def kind(self) -> Kind:
-        """The kind of all of them."""
+        """Kind of the images."""
 
     @property
     def series(self) -> Series:
         """Numbers and times of the images."""
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
-        """RGB [H, W, 3] uint8, or depth [H, W] as stored, at ascending places. Raises InputError."""
+        """RGB [H, W, 3] uint8, or depth [H, W] as stored, at ascending indices. Raises InputError."""
 
     def files(self, places: Sequence[int]) -> list[Path]:
-        """The files that hold them."""
+        """The files that contain the images at these indices."""
 
 
 def matched(where: object, names: tuple[str, str], one: Series, other: Series, pairing: Pairing | None) -> dict[int, int]:
-    """Place in `other` of the image of each moment, by its number in `one`.
+    """Frame number in `one` -> index of the paired image in `other`.
 
-    Stamps decide where both streams have them: the nearest, at most half a frame apart. Else both must have the same frame numbers,
-    unless `pairing` states that equal names or the order belong together. Raises InputError naming `where` and the two `names`.
+    If both streams have stamps, each image is paired with the nearest, at most half a frame apart. Otherwise both must have the
+    same frame numbers, unless `pairing` states that equal names or the order pair them. Raises InputError with `where` and the two
+    `names`.
     """
     if one.times is not None and other.times is not None:
         return _by_time(where, names, one, other)
@@ -91,7 +92,7 @@ def matched(where: object, names: tuple[str, str], one: Series, other: Series, p
     received = (
         f"{counts[0]} images ({spans(one.numbers)}) and {counts[1]} ({spans(other.numbers)}): equal numbers pair {by_number}, "
     )
-    remedy = "State --pair names or --pair order, or write stamps.csv (file,seconds) into both folders."
+    remedy = "Use --pair names or --pair order, or write stamps.csv (file,seconds) into both folders."
     raise InputError(where, f"{names[0]} and {names[1]} must have the same frame numbers", received + by_order, remedy)
 
 
@@ -107,13 +108,13 @@ def _by_time(where: object, names: tuple[str, str], one: Series, other: Series) 
     if mutual.sum() < min(len(left), len(right)) / 2 or ends_apart:
         received = f"{len(left)} images over {np.ptp(left):.2f} s and {len(right)} over {np.ptp(right):.2f} s: {mutual.sum()} pairs"
         rule = f"{names[0]} and {names[1]} must show the same moments by their stamps"
-        raise InputError(where, rule, received, "Trim both to the same time, or write stamps of one clock.")
+        raise InputError(where, rule, received, "Trim both to the same time, or write stamps from one clock.")
     return {one.numbers[place]: int(forth[place]) for place in np.flatnonzero(mutual)}
 
 
 @dataclass(frozen=True, eq=False)
 class CameraStreams:
-    """The streams of one camera, with what the source states about it."""
+    """The streams of one camera, with unit and lens if the source states them."""
 
     name: str
     color: ImageSource
@@ -132,31 +133,31 @@ class CameraStreams:
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """(place of color, place of depth) of the images that have a partner. Raises InputError."""
+        """(index in color, index in depth) of the paired images. Raises InputError."""
         numbers = self.color.series.numbers
         if self.depth is None:
             return [(place, place) for place in range(len(numbers))]
         names = f"camera {self.name}: color", "depth"
         partner = matched(self.depth.path, names, self.color.series, self.depth.series, self.pairing)
         count = len(self.depth.series.numbers)
-        found = [(place, partner[number] + self.late) for place, number in enumerate(numbers) if number in partner]
-        return [(place, other) for place, other in found if 0 <= other < count]
+        shifted = [(place, partner[number] + self.late) for place, number in enumerate(numbers) if number in partner]
+        return [(place, other) for place, other in shifted if 0 <= other < count]
 
     @cached_property
     def series(self) -> Series:
         """Numbers and times of the pairs."""
-        whole, places = self.color.series, [place for place, _ in self.pairs]
-        times = None if whole.times is None else whole.times[places]
-        return replace(whole, numbers=[whole.numbers[place] for place in places], times=times)
+        color, places = self.color.series, [place for place, _ in self.pairs]
+        times = None if color.times is None else color.times[places]
+        return replace(color, numbers=[color.numbers[place] for place in places], times=times)
 
     @property
     def without_partner(self) -> int:
-        """Images of color and depth that have no partner."""
+        """Number of unpaired images of color and depth."""
         counts = [len(source.series.numbers) for source in (self.color, self.depth) if source is not None]
         return sum(count - len(self.pairs) for count in counts)
 
     def read(self, places: Sequence[int]) -> Iterator[Pair]:
-        """The pairs at ascending places, all of one size. Raises InputError."""
+        """The pairs at ascending indices, all of one size. Raises InputError."""
         pairs, size = [self.pairs[place] for place in places], None
         colors = self.color.read([left for left, _ in pairs])
         depths = repeat(None, len(pairs)) if self.depth is None else self.depth.read([right for _, right in pairs])
@@ -185,9 +186,9 @@ class FrameChoice:
     numbers: list[int]
     """Number in the source, per frame of the capture."""
     places: dict[str, dict[int, int]]
-    """Camera -> frame of the capture -> place in its view; a frame that the camera misses is absent."""
+    """Camera -> frame of the capture -> index in the camera's pairs; missing frames are absent."""
     step: int
-    """Every so many frames of the source are kept."""
+    """One in this many frames of the source is kept."""
 
     def missing(self, camera: str) -> tuple[int, ...]:
         """Frames that the camera misses."""
@@ -200,9 +201,9 @@ class FrameChoice:
 
 
 def choose(views: Sequence[CameraStreams], wanted: str, pairing: Pairing | None, late: Mapping[str, int]) -> FrameChoice:
-    """The frames that `wanted` (FIRST-LAST or FIRST-LAST/STEP) keeps, numbered as those of the first camera.
+    """The frames that `wanted` (FIRST-LAST or FIRST-LAST/STEP) selects, by the numbers of the first camera.
 
-    Raises InputError for too few frames, or a camera without the first frame or half of the others.
+    Raises InputError for too few frames, or a camera without the first frame or half of the frames.
     """
     first, where = views[0], dict[str, dict[int, int]]()
     for view in views:
@@ -217,9 +218,9 @@ def choose(views: Sequence[CameraStreams], wanted: str, pairing: Pairing | None,
     places = {name: {frame: of[number] for frame, number in enumerate(kept) if number in of} for name, of in where.items()}
     for view in views:
         if len(places[view.name]) < len(kept) / 2 or 0 not in places[view.name]:
-            rule = f"camera {view.name} must have the first of the chosen frames, number {kept[0]}, and half of the others"
+            rule = f"camera {view.name} must have the first chosen frame, number {kept[0]}, and half of all chosen frames"
             start = next((number for number in kept if all(number in of for of in where.values())), None)
-            remedy = "" if start in (None, kept[0]) else f"The first frame of all cameras is number {start}."
+            remedy = "" if start in (None, kept[0]) else f"Start at number {start}, the first frame of all cameras."
             raise InputError(view.path, rule, f"{len(places[view.name])} of {len(kept)} frames", remedy)
     return FrameChoice(kept, places, int(np.diff(np.searchsorted(numbers, kept)).min()))
 

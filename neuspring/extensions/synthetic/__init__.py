@@ -1,9 +1,9 @@
-"""Synthetic scenes with known truth: the 22 scenes, simulated by finite elements, filmed, and perception judged by their truth.
+"""Synthetic scenes with known truth: 22 scenes, simulated with finite elements and rendered as RGBD video.
 
-- `source`: what the registries of sources and trackers hold; `settings`: the section `synthetic`.
-- `make`: a scene -> capture folder and truth; `scenes`: the 22 scenes and their hands.
-- `bodies`: cloths, ropes, a package, plush animals; `meshes`: tetrahedra and boxes that they are made of.
-- `fem`: Newton's finite elements, two engines; `kernels`: Warp kernels of theirs.
-- `truth`: what methods may not read, and where a material point goes; `exact`: exact tracks and the true surface.
-- `judge`: the stage that measures perception; `errors`: its numbers.
+- `source`: entries of the registries of sources and trackers. `settings`: the section `synthetic`.
+- `make`: writes the capture folder and the truth of a scene. `scenes`: the 22 scenes and their hands.
+- `bodies`: cloths, ropes, a package, plush animals. `meshes`: their tetrahedra and boxes.
+- `fem`: two finite-element engines of Newton. `kernels`: Warp kernels of these engines.
+- `truth`: the truth, which methods must not read, and motion of material points. `exact`: exact tracks and the true surface.
+- `judge`: the stage that measures perception against the truth. `errors`: its error measures.
 """

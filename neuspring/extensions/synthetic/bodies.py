@@ -1,8 +1,8 @@
-"""Bodies at rest with known, uneven materials and a textured skin: cloths with hems, ropes with knots, a carton around a soft
-filling, plush animals.
+"""Bodies at rest with known, nonuniform materials and a textured skin: cloths, ropes, a package, plush animals.
 
-The animals are smooth unions of simple parts, soft filling of uneven stiffness in a skin of fabric: a sloth that lies on its belly,
-a zebra on its four legs, a dinosaur that sits on its legs and tail. x points to the head.
+Cloths have hems, ropes have knots, and the package is a carton around a soft filling. The animals are smooth unions of simple
+parts: a soft filling of nonuniform stiffness in a skin of fabric. The sloth lies on its belly, the zebra stands on its four legs,
+and the dinosaur sits on its legs and tail; x points to the head.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from neuspring.scenes.shapes import Sdf, capsule, ellipsoid, smooth_union, spher
 
 
 def _empty(*shape: int) -> Any:
-    """A field that is an empty array by default; of indices if it has columns."""
+    """A field whose default is an empty array, of indices if it has columns."""
     return field(default_factory=lambda: np.zeros(shape, int if len(shape) > 1 else float))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """The visible skin: triangles whose vertices are bound to mesh nodes once, hence exact correspondences in every frame."""
+    """The visible skin: triangles whose vertices are bound to mesh nodes, with exact correspondences in every frame."""
 
     rest: np.ndarray
     """Vertices at rest [V, 3], m; the texture is a function of these."""
     faces: np.ndarray
     """[F, 3] indices of vertices, outward."""
     nodes: np.ndarray
-    """[V, k] nodes that a vertex follows."""
+    """[V, k] nodes that each vertex follows."""
     weights: np.ndarray
-    """[V, k] their weights, sum 1."""
+    """[V, k] weights of the nodes, with sum 1."""
     colors: np.ndarray
     """[V, 3] linear RGB in [0, 1], before the fine texture."""
 
@@ -44,7 +44,7 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class SoftBody:
-    """Geometry and true material. Solids are tetrahedra (some with a fabric skin), sheets are triangles with bending."""
+    """Geometry and true material. Solids have tetrahedra, some with a fabric skin; sheets have triangles with bending."""
 
     nodes: np.ndarray
     """Rest positions [N, 3], m, resting on or above the table z = 0."""
@@ -64,13 +64,13 @@ class SoftBody:
     membrane: np.ndarray = _empty(0)
     """[M], N/m: in-plane stiffness of triangles."""
     sheet_density: float = 0.0
-    """kg/m^2; zero for skins, whose mass is in the solid."""
+    """kg/m^2; zero for skins, whose mass belongs to the solid."""
     bending: np.ndarray = _empty(0)
-    """[N], N m: bending stiffness of a sheet around each node (its edges take the mean of their ends)."""
+    """[N], N m: bending stiffness of a sheet at each node; edges have the mean of their ends."""
     air_drag: float = 0.0
     """Aerodynamic drag of triangles."""
     viscosity: tuple[float, float] = (0.0, 0.1)
-    """Maxwell branch: its modulus in parts of Young's modulus, and its relaxation time, s."""
+    """Maxwell branch: modulus as a fraction of Young's modulus, and relaxation time, s."""
     contact_stiffness: float = 150.0
     """Contact stiffness of nodes against table and hands, N/m."""
     contact_damping: float = 0.02
@@ -104,15 +104,15 @@ class Fabric:
     bending: float
     """N m."""
     hem: float
-    """Width of the border, m, in which membrane and bending are HEM times larger."""
+    """Width of the border, m, in which membrane and bending are multiplied by HEM."""
     pattern: Pattern
 
 
 HEM = (3.0, 10.0)
 """Factors of membrane and bending in the hem."""
 SHEET_RADIUS = 0.4
-"""Contact radius of a sheet's nodes in node spacings: below half a spacing neighbors do not repel each other, above 0.36 a
-cell's diagonal is closed."""
+"""Contact radius of a sheet's nodes, in node spacings. Below 0.5, neighbors do not repel each other; above 0.36, nothing fits
+through the diagonal of a cell."""
 
 
 def _checks(size: float, first: tuple[float, ...], second: tuple[float, ...]) -> Pattern:
@@ -145,14 +145,14 @@ FABRICS = {
 
 
 def cloth(name: str, spacing: float, skin_spacing: float) -> SoftBody:
-    """A cloth of FABRICS flat on the table. `spacing` of nodes, `skin_spacing` of visible vertices, m."""
+    """A cloth of FABRICS, flat on the table, with `spacing` of nodes and `skin_spacing` of visible vertices, m."""
     fabric = FABRICS[name]
     counts = [round(size / spacing) + 1 for size in (fabric.width, fabric.height)]
     axes = [np.linspace(-size / 2, size / 2, n) for size, n in zip((fabric.width, fabric.height), counts, strict=True)]
     x, y = np.meshgrid(*axes, indexing="ij")
     radius = SHEET_RADIUS * spacing
     nodes = np.stack([x.ravel(), y.ravel(), np.full(x.size, radius + 0.0005)], axis=1)
-    # A perfectly flat sheet has no preferred side to buckle to; weave is never perfectly flat.
+    # A perfectly flat sheet would have no direction to buckle.
     nodes[:, 2] += 1e-4 * np.random.default_rng(0).normal(size=len(nodes))
     ids = np.arange(x.size).reshape(counts)
     a, b, c, d = ids[:-1, :-1].ravel(), ids[1:, :-1].ravel(), ids[1:, 1:].ravel(), ids[:-1, 1:].ravel()
@@ -180,7 +180,7 @@ def cloth(name: str, spacing: float, skin_spacing: float) -> SoftBody:
 
 
 ROPES = {"twine": (0.5, (0.06,), (0.75, 0.68, 0.5)), "cord": (0.44, (-0.1, 0.12), (0.3, 0.45, 0.7))}
-"""Length, m; places of knots along x, m; color."""
+"""Length, m; positions of knots along x, m; color."""
 ROPE_RADIUS = 0.006
 KNOT_RADIUS = 0.0095
 KNOT_WIDTH = 0.012
@@ -201,7 +201,7 @@ def rope(name: str, spacing: float, skin_spacing: float) -> SoftBody:
     def paint(p: np.ndarray) -> np.ndarray:
         turn = np.arctan2(p[:, 2] - ROPE_RADIUS - radius, p[:, 1]) / (2 * np.pi)
         strand = (p[:, 0] * 60.0 + turn) % 1.0 < 0.5
-        # Every seventh turn carries a colored thread, so that one place differs from the next.
+        # A colored thread on every seventh turn distinguishes positions along the rope.
         thread = ((p[:, 0] * 60.0 + turn) // 1.0) % 7 == 0
         shade = np.where(strand[:, None], 0.55, 1.0) * np.array(color)
         return np.asarray(np.where(thread[:, None], shade * [0.9, 0.35, 0.3], shade))
@@ -264,23 +264,23 @@ def package(spacing: float, skin_spacing: float) -> SoftBody:
 
 
 def skin_of(nodes: np.ndarray, faces: np.ndarray, spacing: float, paint: Pattern) -> Surface:
-    """The surface of mesh faces, each divided evenly until vertices lie about `spacing` apart."""
+    """The surface of mesh faces, each divided evenly until vertices are about `spacing`, m, apart."""
     longest = np.linalg.norm(nodes[faces[:, 0]] - nodes[faces[:, 1]], axis=1).max()
     parts = max(int(np.ceil(longest / spacing)), 1)
     inner = [(i, j, parts - i - j) for i in range(parts + 1) for j in range(parts + 1 - i)]
-    place = {point: k for k, point in enumerate(inner)}
+    index_of = {point: k for k, point in enumerate(inner)}
     weights = np.array(inner) / parts
-    own = [
+    triangles = [
         corners
         for i, j, k in inner
         for corners in (
             ((i, j, k), (i + 1, j, k - 1), (i, j + 1, k - 1)),
             ((i + 1, j, k - 1), (i + 1, j + 1, k - 2), (i, j + 1, k - 1)),
         )
-        if all(corner in place for corner in corners)
+        if all(corner in index_of for corner in corners)
     ]
     # Barycentric coordinates (i, j, k) belong to corners 0, 1, 2: this order keeps the face's orientation.
-    small = np.array([[place[c] for c in (t[0], t[1], t[2])] for t in own])
+    small = np.array([[index_of[c] for c in (t[0], t[1], t[2])] for t in triangles])
     points = np.einsum("ws,fsc->fwc", weights, nodes[faces])
     all_faces = (small[None] + len(inner) * np.arange(len(faces))[:, None, None]).reshape(-1, 3)
     _, first, inverse = np.unique(points.reshape(-1, 3).round(7), axis=0, return_index=True, return_inverse=True)
@@ -304,12 +304,12 @@ SKIN = 60.0
 """N/m."""
 RADIUS = 0.004
 CLEARANCE = 0.0045
-"""m, of the lowest node above the table; its contact radius is 4 mm."""
+"""Height of the lowest node above the table, m; the contact radius is 4 mm."""
 Paint = Callable[[np.ndarray, Mapping[str, Sdf]], np.ndarray]
 
 
 def sloth(spacing: float, skin_spacing: float) -> SoftBody:
-    """0.3 m long, arms and legs spread. Stiff head, soft limbs."""
+    """A sloth of 0.3 m length with spread arms and legs, a stiff head and soft limbs."""
     parts = {
         "body": ellipsoid((0, 0, 0.05), (0.085, 0.06, 0.045)),
         "head": ellipsoid((0.1, 0, 0.062), (0.045, 0.05, 0.042)),
@@ -323,7 +323,7 @@ def sloth(spacing: float, skin_spacing: float) -> SoftBody:
 
 
 def zebra(spacing: float, skin_spacing: float) -> SoftBody:
-    """0.28 m long, 0.19 m tall. Stiff head and legs, soft belly and tail."""
+    """A zebra of 0.28 m length and 0.19 m height, with stiff head and legs and soft belly and tail."""
     parts = {
         "body": capsule((-0.055, 0, 0.1), (0.055, 0, 0.104), 0.045),
         "neck": capsule((0.055, 0, 0.11), (0.1, 0, 0.155), 0.03),
@@ -340,7 +340,7 @@ def zebra(spacing: float, skin_spacing: float) -> SoftBody:
 
 
 def dinosaur(spacing: float, skin_spacing: float) -> SoftBody:
-    """0.32 m long with its tail, 0.2 m tall. Stiff head and tail, soft arms and legs."""
+    """A dinosaur of 0.32 m length with its tail and 0.2 m height, with stiff head and tail and soft arms and legs."""
     parts = {
         "body": ellipsoid((0, 0, 0.08), (0.06, 0.052, 0.065)),
         "neck": capsule((0.03, 0, 0.12), (0.05, 0, 0.165), 0.032),
@@ -358,7 +358,7 @@ def dinosaur(spacing: float, skin_spacing: float) -> SoftBody:
 
 
 def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint, spacing: float, skin_spacing: float) -> SoftBody:
-    """`factors` multiply the filling's modulus in parts whose names begin so; the nearest part of a tetrahedron decides."""
+    """An animal of `parts`. `factors` multiply the modulus of tetrahedra whose nearest part has a name with this prefix."""
     shape = smooth_union(parts.values(), BLEND)
     low, high = (-0.24, -0.18, -0.02), (0.2, 0.18, 0.26)
     nodes, tetrahedra = fill(shape, low, high, spacing)
@@ -387,7 +387,7 @@ def _animal(parts: Mapping[str, Sdf], factors: Mapping[str, float], paint: Paint
 
 
 def _level(points: np.ndarray, center: Sequence[float], radii: float | Sequence[float] = 1.0) -> np.ndarray:
-    """Distances of points from a center, in radii of an ellipsoid."""
+    """Distances [n] of points from a center, in radii of an ellipsoid."""
     return np.asarray(np.linalg.norm((points - np.array(center)) / radii, axis=1))
 
 
@@ -402,7 +402,7 @@ def _paint_sloth(points: np.ndarray, parts: Mapping[str, Sdf]) -> np.ndarray:
         colors[eye < 0.006] = [0.01, 0.01, 0.01]
     tips = (np.abs(points[:, 1]) > 0.115) | ((points[:, 0] < -0.1) & (np.abs(points[:, 1]) > 0.075))
     colors[tips] = [0.62, 0.5, 0.36]
-    # Rings of darker fur on the limbs and a stripe along the back give trackers something to hold.
+    # Dark rings on the limbs and a stripe along the back add texture for trackers.
     rings = (np.sin(points @ np.array([90.0, 130.0, 40.0])) > 0.55) & ~face
     colors[rings] *= 0.55
     return colors

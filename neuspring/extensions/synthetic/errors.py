@@ -1,4 +1,4 @@
-"""Synthetic captures, whose truth is known: errors of masks, tracks, lifted points, controllers and hull."""
+"""Errors of masks, tracks, lifted points, controllers and hull, measured against the truth of synthetic captures."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from neuspring.perception.shape import visual_hull
 
 IN_MM = 1e3
 VOLUME_GRID = 0.003
-"""m between the points on which volumes are compared."""
+"""m. Spacing of the grid on which volumes are compared."""
 SURFACE_POINTS = 4000
-"""Most vertices of a surface whose distances are averaged."""
+"""Largest number of surface vertices whose distances are averaged."""
 
 
 def judge(
@@ -33,7 +33,7 @@ def judge(
     lifted: LiftedTracks,
     settings: ShapePriorSettings,
 ) -> dict[str, float]:
-    """Quality numbers; lengths in mm, image errors in pixels, shares and IoU in 0 to 1."""
+    """Quality measures: lengths in mm, image errors in pixels, fractions and IoU from 0 to 1."""
     facts = mask_quality(capture, masks) | track_quality(capture, truth, tracks) | lifted_quality(truth, lifted)
     if len(truth.tetrahedra):
         facts |= hull_quality(capture, truth, masks, lifted.cloud, settings)
@@ -41,7 +41,7 @@ def judge(
 
 
 def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, float]:
-    """Mean intersection over union with the true masks, over cameras and frames that show the thing."""
+    """Mean intersection over union with the true masks, over the cameras and frames that show the label."""
     views = [(camera, frame) for camera in capture.cameras for frame in frames_of(capture, camera)]
     facts = {}
     for name, label in (("object", OBJECT), ("hands", HANDS)):
@@ -51,7 +51,7 @@ def mask_quality(capture: Capture, masks: Mapping[str, Masks]) -> dict[str, floa
 
 
 def track_quality(capture: Capture, truth: Truth, tracks: Mapping[str, PixelTracks]) -> dict[str, float]:
-    """Error in pixels of visible points on the object after frame 0, and the share that is still followed in the last frame."""
+    """Error in pixels of visible object points after frame 0, and the fraction that is still tracked in the last frame."""
     errors, alive = [], []
     for name, camera in capture.cameras.items():
         pixels, visible = tracks[name].pixels, tracks[name].visible
@@ -66,8 +66,7 @@ def track_quality(capture: Capture, truth: Truth, tracks: Mapping[str, PixelTrac
 
 
 def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
-    """Distance in mm of lifted points from the material that they were nearest to in frame 0, and of controllers from the rigid
-    motion of their hand."""
+    """Distance in mm of lifted points from their nearest material of frame 0, and of controllers from their hand's rigid motion."""
     off = np.linalg.norm(at_points(truth, lifted.object_points[0]).places - lifted.object_points, axis=2)
     visible = lifted.object_visibility[1:]
     trusted = lifted.object_motion_valid[:-1] & visible
@@ -77,7 +76,7 @@ def lifted_quality(truth: Truth, lifted: LiftedTracks) -> dict[str, float]:
 
 
 def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
-    """[C, T - 1], m; a controller belongs to the hand whose motion it follows best."""
+    """Errors of controllers [C, T - 1], m; each is compared with the hand whose motion it follows best."""
     poses = truth.hand_poses.astype(float)
     hands = [carried(controllers[0], poses[:, hand]) for hand in range(poses.shape[1])]
     off = np.stack([np.linalg.norm(places - controllers, axis=2)[1:] for places in hands])
@@ -88,7 +87,7 @@ def _controller_errors(truth: Truth, controllers: np.ndarray) -> np.ndarray:
 def hull_quality(
     capture: Capture, truth: Truth, masks: Mapping[str, Masks], cloud: np.ndarray, settings: ShapePriorSettings
 ) -> dict[str, float]:
-    """Volume IoU and mean surface distance of the visual hull of all cameras, and of the first one and two."""
+    """Volume IoU and mean surface distance of the visual hull from the first camera, the first two, and so on."""
     surface = ShapePrior(vertices=truth.surface(0), faces=truth.surface_faces, backend="truth")
     facts = {}
     for count in range(1, len(capture.cameras) + 1):
@@ -107,14 +106,14 @@ def hull_quality(
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
-    """Mean of both mean nearest distances between vertices, m."""
+    """Mean distance to the nearest vertex, m, averaged over both directions."""
     rng = np.random.default_rng(0)
-    some, others = (rng.permutation(points)[:SURFACE_POINTS] for points in (first, second))
-    return float((cKDTree(second).query(some)[0].mean() + cKDTree(first).query(others)[0].mean()) / 2.0)
+    of_first, of_second = (rng.permutation(points)[:SURFACE_POINTS] for points in (first, second))
+    return float((cKDTree(second).query(of_first)[0].mean() + cKDTree(first).query(of_second)[0].mean()) / 2.0)
 
 
 def _spread(name: str, values: np.ndarray, unit: str) -> dict[str, float]:
-    """Median and 95th percentile; neither where there is nothing."""
+    """Median and 95th percentile; empty without values."""
     if not values.size:
         return {}
     return {f"{name}_median_{unit}": float(np.median(values)), f"{name}_p95_{unit}": float(np.percentile(values, 95))}

@@ -1,8 +1,8 @@
-"""Finite elements with hands: the motion that synthetic captures show, by Newton's solvers.
+"""Finite elements with hands, which create the motion of synthetic captures with Newton's solvers.
 
-Their numerics have nothing in common with the spring-mass simulator of the twins: stable neo-Hookean tetrahedra, membranes with
-hinge bending, penalty contacts. Substeps follow from the largest eigenvalue of the engine's own forces. `FiniteElements` is
-explicit (semi-implicit Euler); `VertexBlockDescent` is a second engine, for a held-out split with other numerics.
+The numerics differ from the spring-mass simulator of the twins: stable neo-Hookean tetrahedra, membranes with hinge bending, and
+penalty contacts. `FiniteElements` is explicit (semi-implicit Euler); the largest eigenvalue of its forces determines the substeps.
+`VertexBlockDescent` is the held-out engine.
 """
 
 from __future__ import annotations
@@ -27,39 +27,41 @@ from neuspring.scenes.rays import on_cpu
 if TYPE_CHECKING:
     import newton
 else:
-    # Modules take Warp's settings when they are made: without adjoints the engine's kernels compile in half the time.
+    # Warp modules copy the settings at import: without adjoints the engine's kernels compile in half the time.
     start_warp()
     newton = needed("newton")
 
 GRAVITY = 9.81
 """m/s^2, towards -z."""
 CONTACT_GRID = (32, 32, 32)
-"""Cells in which near nodes are looked for. The engine's 128 in each direction are emptied in every substep: most of its time."""
+"""Cells of the neighbor search. Clearing the engine's default of 128 cells per axis would take most of each substep."""
 LEAST_MASS = 0.3
-"""Nodes of a solid weigh at least this fraction of the median node; lighter ones alone would dictate the step."""
+"""Smallest mass of a solid's node, as a fraction of the median; lighter nodes would determine the time step."""
 MAX_SPEED = 20.0
 """m/s; the engine clips faster nodes."""
 Moduli = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def lame(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lame parameters mu, lambda, Pa."""
+    """Lame parameters mu and lambda, Pa."""
     mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
     return mu, youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
 
 
 def stable_moduli(youngs_modulus: np.ndarray, poisson_ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Constants of the semi-implicit engine's stable neo-Hookean energy (Smith et al. 2018) for these small-strain moduli:
-    4/3 mu and lambda + 5/6 mu."""
+    """Constants 4/3 mu and lambda + 5/6 mu, Pa, of the engine's stable neo-Hookean energy for these small-strain moduli.
+
+    Source: Smith et al. 2018.
+    """
     mu, first = lame(youngs_modulus, poisson_ratio)
     return 4.0 / 3.0 * mu, first + 5.0 / 6.0 * mu
 
 
 def build(body: SoftBody, fists: int, moduli: Moduli = stable_moduli, dashpots: bool = True, colored: bool = False) -> newton.Model:
-    """The engine's model of a body, a table and kinematic fists.
+    """Build the engine's model of a body, a table and kinematic fists.
 
-    `dashpots`: a spring of no stiffness on every edge of a solid, whose damping the caller sets. `colored`: nodes in groups that
-    do not meet, for solvers that move one node after the other.
+    `dashpots` adds a spring without stiffness to every edge of a solid; the caller sets its damping. `colored` groups nodes so that
+    no two nodes of a group are connected, for solvers that move one node after the other.
     """
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     shape = builder.default_shape_cfg.copy()
@@ -129,32 +131,32 @@ def _add_sheet(builder: newton.ModelBuilder, body: SoftBody) -> None:
 
 
 SAFETY = 0.6
-"""Fraction of the critical step."""
+"""Time step as a fraction of the critical step."""
 COLLIDE_EVERY = 5
-"""Substeps between searches for contacts, whose margin covers what happens between."""
+"""Substeps between contact searches; the contact margin covers the motion between them."""
 DAMP_EVERY = 4
-"""Substeps between dampings of the deformation, a slow process."""
+"""Substeps between dampings of the deformation, which is a slow process."""
 PERIOD = math.lcm(COLLIDE_EVERY, DAMP_EVERY, 2)
-"""Substeps after which a frame's pattern of contacts, dampings and exchanged states begins again."""
+"""Substeps after which the sequence of contacts, dampings and swapped states repeats."""
 CONTACT_MARGIN = 0.02
 """m."""
 POWER_ITERATIONS = 60
 NUDGE = 1e-6
-"""m, standard deviation per coordinate: the rounding of single precision over a few substeps."""
+"""m. Standard deviation per coordinate, about the rounding of single precision over a few substeps."""
 ESCAPED = 5.0
-"""m; further from the origin a clip counts as diverged."""
+"""m. A clip with a node farther from the origin has diverged."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Damping:
-    """Numerical damping beside the material's."""
+    """Numerical damping, in addition to that of the material."""
 
     deformation: float = 2.0
-    """1/s, of motion relative to the best rigid motion."""
+    """1/s. Damping of motion relative to the best rigid motion."""
     drag: float = 0.1
-    """1/s, of all motion."""
+    """1/s. Damping of all motion."""
     edges: float = 0.35
-    """Dashpots on the edges of tetrahedra, in parts of what the time step allows: they end the ringing of single elements."""
+    """Dashpots on the edges of tetrahedra, as a fraction of the largest stable ones; they damp oscillations of single elements."""
 
 
 @dataclass(frozen=True)
@@ -173,10 +175,10 @@ class Clip:
 
 
 class FiniteElements:
-    """A body with its hands, from `start` (rest shape where None), on one core.
+    """Simulates a body with its hands from `start` (None: the rest shape), on one core.
 
-    `substeps`, an even number, defaults to what the critical step asks for. `holder` [N] says which hand holds each node (-1:
-    none); by default a hand holds the nodes in its reach.
+    `substeps` is even; its default follows from the critical step. `holder` [N] is the hand that holds each node (-1: none); by
+    default a hand holds the nodes within its reach.
     """
 
     def __init__(
@@ -193,7 +195,7 @@ class FiniteElements:
         self.body, self.hands, self.frames, self.frame_rate, self.damping = body, tuple(hands), frames, frame_rate, damping
         self.start = body.nodes if start is None else start
         fists = [index for index, hand in enumerate(hands) if hand.kind == "fist"]
-        # The engine declares every array of models and states as possibly missing; ours are not.
+        # The engine declares all arrays of models and states as optional; these exist.
         self.model: Any = self._build(len(fists))
         self.volumes = volumes(body.nodes, body.tetrahedra)
         self.mass: np.ndarray = self.model.particle_mass.numpy().astype(float)  # type: ignore[union-attr]
@@ -210,11 +212,11 @@ class FiniteElements:
 
     @property
     def substep(self) -> float:
-        """s."""
+        """Length of a substep, s."""
         return 1.0 / (self.frame_rate * self.substeps)
 
     def again(self, frames: int, start: np.ndarray, substeps: int) -> Self:
-        """A new engine for the same body and hands. The hands hold the same nodes even if `start` differs."""
+        """A new engine with the same body and hands; the hands hold the same nodes even if `start` differs."""
         return type(self)(self.body, self.hands, frames, self.frame_rate, self.damping, start, substeps, self.holder)
 
     def run(self) -> Clip:
@@ -241,13 +243,13 @@ class FiniteElements:
         return substeps or max(2 * int(np.ceil(1.0 / (self.frame_rate * step) / 2)), 2)
 
     def _maxwell_state(self) -> list[wp.array] | None:
-        """Tetrahedra, inverse rest shapes, volumes, moduli, strain and stress of the Maxwell branch."""
+        """Tetrahedra, inverse rest shapes, volumes, moduli, strain and stress of the Maxwell branch; None without one."""
         body = self.body
         share = body.viscosity[0]
         if body.is_sheet or not share:
             return None
         corners = (positions[body.tetrahedra] for positions in (body.nodes, self.start))
-        # Edge matrices [E, 3, 3]: columns from corner 0 to the others.
+        # Edge matrices [E, 3, 3]: columns point from corner 0 to corners 1, 2 and 3.
         rest, deformed = (np.swapaxes(each[:, 1:] - each[:, :1], 1, 2) for each in corners)
         inverse = np.linalg.inv(rest)
         gradient = deformed @ inverse
@@ -262,14 +264,14 @@ class FiniteElements:
         ]
 
     def _hold(self, fists: list[int], earlier: np.ndarray | None) -> None:
-        """Place the hands, and give them the nodes that they grip in frame 0, or those of `earlier`."""
+        """Place the hands, and assign the nodes that they hold: those in reach in frame 0, or those of `earlier`."""
         hands = self.hands
         times = np.arange((self.frames - 1) * self.substeps + 2) * self.substep
         poses = np.stack([hand.poses(times) for hand in hands]) if hands else np.zeros((1, len(times), 7))
         holder, local = np.full(len(self.start), -1, dtype=np.int32), np.zeros((len(self.start), 3))
         for index, hand in enumerate(hands):
-            # Keys are turns from frame 0, in which a hand's frame has the world's axes.
-            assert not np.any(hand.keys[0][2]), "a hand must start unturned"
+            # Rotations of keys are relative to frame 0, in which a hand's frame has the world's axes.
+            assert not np.any(hand.keys[0][2]), "a hand must start without rotation"
             offset = self.start - poses[index, 0, :3]
             if hand.kind == "grip":
                 within = np.linalg.norm(offset, axis=1) < hand.reach
@@ -289,9 +291,10 @@ class FiniteElements:
         self._sums = wp.zeros(19, dtype=wp.float32, device="cpu")
 
     def _frame(self) -> None:
-        """One frame, in runs of substeps that repeat: the first of a length compiles, the second is recorded, others replay it."""
-        whole, rest = divmod(self.substeps, PERIOD)
-        for count in [PERIOD] * whole + [rest] * (rest > 0):
+        """Simulate one frame in repeating blocks of substeps: the first block of a length compiles, the second is recorded as a
+        graph, and later blocks replay the graph."""
+        periods, rest = divmod(self.substeps, PERIOD)
+        for count in [PERIOD] * periods + [rest] * (rest > 0):
             if count not in self._graphs:
                 self._substeps(count)
                 with wp.ScopedCapture(device="cpu") as capture:
@@ -301,7 +304,7 @@ class FiniteElements:
                 wp.capture_launch(self._graphs[count])
 
     def _substeps(self, count: int) -> None:
-        """The first substeps of a frame; every PERIOD they begin again."""
+        """Simulate the first `count` substeps of a PERIOD."""
         dt, contacts = self.substep, self.contacts
         for k in range(count):
             now, following = self.now, self.next
@@ -321,12 +324,12 @@ class FiniteElements:
             self.now, self.next = following, now
 
     def _drive(self, state: newton.State) -> None:
-        """Put held nodes where their hands are."""
+        """Move held nodes with their hands."""
         held = [self._step, self._poses, self._holder, self._local, self.substep, state.particle_q, state.particle_qd]
         wp.launch(kernels.drive_nodes, self.model.particle_count, held, device="cpu")
 
     def _add_maxwell(self, state: newton.State, decay: float, fresh: bool = False) -> None:
-        """Forces of the Maxwell branch; `fresh`: of one without strain and stress, whose own stay."""
+        """Add the forces of the Maxwell branch; with `fresh`, start from zero strain and stress and keep the stored ones."""
         if self._maxwell is None:
             return
         *fixed, strain, stress = self._maxwell
@@ -365,10 +368,10 @@ class FiniteElements:
         return positions.copy(), kinetic, potential, jacobian
 
     def _critical_step(self) -> tuple[float, float]:
-        """SAFETY times the largest stable step, s, and the dashpot of every edge, N s/m, that goes with it.
+        """SAFETY times the largest stable step, s, and the matching dashpot of every edge, N s/m.
 
-        Symplectic Euler is stable for dt < (-c + sqrt(c^2 + 4 w^2)) / w^2, w^2 the largest eigenvalue of M^-1 K and c that of
-        M^-1 C, both by power iteration on the engine's forces.
+        Symplectic Euler is stable for dt < (-c + sqrt(c^2 + 4 w^2)) / w^2. Here w^2 is the largest eigenvalue of M^-1 K, and c that
+        of M^-1 C; both follow from power iteration on the engine's forces.
         """
         frequency = np.sqrt(self._largest("position"))
         if self.body.is_sheet or not self.damping.edges:
@@ -404,12 +407,12 @@ class FiniteElements:
         return value
 
     def _acceleration(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """[N, 3], m/s^2: the change of velocity over one engine step of one second without contacts."""
+        """Acceleration [N, 3], m/s^2: the change of velocity in one engine step of one second without contacts."""
         state, after = self.now, self.next
         state.particle_q.assign(positions.astype(np.float32))
         state.particle_qd.assign(velocities.astype(np.float32))
         state.clear_forces()
-        # An instantaneous change of strain loads the branch like a spring of its modulus.
+        # An instantaneous change of strain loads the branch like a spring with its modulus.
         self._add_maxwell(state, 1.0, fresh=True)
         limit, grid = self.model.particle_max_velocity, self.model.particle_grid
         self.model.particle_max_velocity, self.model.particle_grid = np.inf, None
@@ -422,8 +425,10 @@ class FiniteElements:
 
 
 def settle(body: SoftBody, frame_rate: float, seconds: float = 4.0, still: float = 0.01) -> np.ndarray:
-    """Node positions [N, 3], m, of the body lying on the table: dropped with strong drag until no node moves faster than `still`,
-    m/s, at most `seconds`."""
+    """Node positions [N, 3], m, of the body at rest on the table.
+
+    The body is dropped with strong drag until no node is faster than `still`, m/s, for at most `seconds`.
+    """
     position, frames = body.nodes, max(int(0.5 * frame_rate), 2)
     for _ in range(int(np.ceil(2 * seconds))):
         engine = FiniteElements(body, (), frames, frame_rate, Damping(deformation=8.0, drag=4.0), start=position)
@@ -434,10 +439,10 @@ def settle(body: SoftBody, frame_rate: float, seconds: float = 4.0, still: float
 
 
 def certify(engine: FiniteElements, clip: Clip, frames: int) -> tuple[float, float]:
-    """Motion, m, of the mean node of the first `frames` frames of the `engine`'s clip (largest of all frames) with twice the
-    substeps, and with a start that is NUDGE off.
+    """Mean distance of nodes from `clip`, m, in the worst of the first `frames` frames.
 
-    A cloth that wrinkles multiplies any difference: there the second figure, not zero, is what the first has to be compared with.
+    The first value is for twice the substeps, the second for a start that is NUDGE off. A wrinkling cloth amplifies any difference,
+    so compare the first value with the second, not with zero.
     """
     frames = min(frames, len(clip.positions))
     nudged = engine.start + NUDGE * np.random.default_rng(0).normal(size=engine.start.shape)
@@ -451,14 +456,14 @@ def _stable(frequency: float, damping: float) -> float:
 
 
 VBD_SUBSTEPS, VBD_ITERATIONS = 40, 10
-"""Converged here, and far from it at what games use: neither is a setting."""
+"""Converged values for these scenes; the smaller values of games are far from convergence."""
 
 
 class VertexBlockDescent(FiniteElements):
-    """Vertex block descent (Chen et al. 2024): implicit Euler solved node by node. Solids that hands grip; no fists, no sheets.
+    """Vertex block descent (Chen et al. 2024): implicit Euler, solved node by node, for solids that hands grasp.
 
-    It takes the plain Lame parameters. Its damping is that of implicit Euler, not a material's. Its friction is the engine's
-    smoothed Coulomb friction.
+    Fists and sheets are not supported. The material has the plain Lame parameters. Damping comes only from implicit Euler, and
+    friction is the engine's smoothed Coulomb friction.
     """
 
     def _build(self, fists: int) -> newton.Model:
@@ -476,7 +481,7 @@ class VertexBlockDescent(FiniteElements):
 
     def _hold(self, fists: list[int], earlier: np.ndarray | None) -> None:
         super()._hold(fists, earlier)
-        # Without mass a node would still give way to its neighbors.
+        # Inactive, because even a node without inverse mass would yield to its neighbors.
         flags = np.where(self.holder < 0, int(newton.ParticleFlags.ACTIVE), 0)
         self.model.particle_flags.assign(flags.astype(np.int32))
 
@@ -484,7 +489,7 @@ class VertexBlockDescent(FiniteElements):
         for _ in range(count):
             now, following = self.now, self.next
             now.clear_forces()
-            # Held nodes do not move within a step: they are put where they are at its end.
+            # Held nodes do not move within a step, so they get their position at its end.
             wp.launch(kernels.advance, 1, [self._step], device="cpu")
             self._drive(now)
             self.pipeline.collide(now, self.contacts)

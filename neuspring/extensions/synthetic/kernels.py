@@ -1,8 +1,8 @@
 """Warp kernels of synthetic scenes.
 
-- What the finite-element engine lacks: driven nodes and fists, a Maxwell branch, Coulomb friction, damping of deformation. None of
-  them carries stiffness; elasticity, bending, normal contact and integration are the engine's.
-- A point of a mesh: along a ray, or nearest to a place.
+- Additions to the finite-element engine: driven nodes and fists, a Maxwell branch, Coulomb friction, damping of deformation. They
+  add no stiffness; elasticity, bending, normal contact and integration are those of the engine.
+- Queries of a mesh: the first hit of a ray, and the nearest point.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ def drive_nodes(
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Held nodes (inverse mass 0) lie where their hand is and get its finite-difference velocity, with which the engine moves
-    them."""
+    """Set held nodes (inverse mass 0) to the pose of their hand, with its finite-difference velocity; the engine moves them."""
     i = wp.tid()
     hand = holder[i]
     if hand < 0:
@@ -41,7 +40,7 @@ def drive_bodies(
     pose: wp.array[wp.transform],
     twist: wp.array[wp.spatial_vector],
 ):
-    """Kinematic fists: pose of the hand, and the linear and angular velocity that takes it to the next step's."""
+    """Set kinematic fists to the pose of their hand, with the linear and angular velocity that leads to the next step's pose."""
     body = wp.tid()
     here = poses[hand_of_body[body], step[0]]
     there = poses[hand_of_body[body], step[0] + 1]
@@ -71,7 +70,10 @@ def maxwell(
     stress: wp.array[wp.mat33],
     force: wp.array[wp.vec3],
 ):
-    """dS/dt = 2 mu dE/dt + lambda tr(dE/dt) I - S / tau, E the Green strain, P = F S: damping that leaves rigid motion alone."""
+    """Add forces of dS/dt = 2 mu dE/dt + lambda tr(dE/dt) I - S / tau, P = F S, with Green strain E.
+
+    This damping does not affect rigid motion.
+    """
     t = wp.tid()
     a = tetrahedra[t, 0]
     b = tetrahedra[t, 1]
@@ -111,9 +113,9 @@ def coulomb(
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Take from the tangential velocity at most mu f_n dt / m, f_n = k depth: sticks without creeping, whatever the time step.
+    """Reduce the tangential velocity by at most mu f_n dt / m, f_n = k depth, which sticks without creep at any time step.
 
-    The engine's own friction is viscous and explodes for stiff settings; it is switched off.
+    The engine's own friction is viscous and unstable for stiff settings, and is switched off.
     """
     t = wp.tid()
     if t >= count[0]:
@@ -143,7 +145,7 @@ def coulomb(
 
 @wp.kernel(enable_backward=False)
 def moments(position: wp.array[wp.vec3], velocity: wp.array[wp.vec3], mass: wp.array[float], sums: wp.array[float]):
-    """Mass, first moments, momentum, angular momentum about the origin, second moments (3 x 3, the upper half)."""
+    """Sum mass, first moments, momentum, angular momentum about the origin, and second moments (upper half of 3 x 3)."""
     i = wp.tid()
     m = mass[i]
     x = position[i]
@@ -168,7 +170,7 @@ def damp_deformation(
     dt: float,
     velocity: wp.array[wp.vec3],
 ):
-    """v -= rate dt (v - v_rigid) + drag dt v, v_rigid the rigid motion of least squares."""
+    """v -= rate dt (v - v_rigid) + drag dt v, with the least-squares rigid motion v_rigid."""
     i = wp.tid()
     if inverse_mass[i] == 0.0:
         return
@@ -182,7 +184,7 @@ def damp_deformation(
     yy = sums[14] - m * center[1] * center[1]
     yz = sums[15] - m * center[1] * center[2]
     zz = sums[18] - m * center[2] * center[2]
-    # A straight rope has no moment of inertia about itself.
+    # A straight rope has no moment of inertia about its axis.
     least = 1.0e-3 * (xx + yy + zz)
     inertia = wp.mat33(yy + zz + least, -xy, -xz, -xy, xx + zz + least, -yz, -xz, -yz, xx + yy + least)
     rigid = mean + wp.cross(wp.inverse(inertia) * spin, position[i] - center)
@@ -193,7 +195,7 @@ def damp_deformation(
 def first_hit(
     mesh: wp.uint64, origin: wp.vec3, rays: wp.array[wp.vec3], farthest: float, face: wp.array[int], weights: wp.array[wp.vec3]
 ):
-    """The triangle that a ray meets first, -1 for none, and the weights of its corners."""
+    """The first triangle on a ray, -1 for none, and the weights of its corners."""
     i = wp.tid()
     hit = wp.mesh_query_ray(mesh, origin, rays[i], farthest)
     face[i] = -1
@@ -204,7 +206,7 @@ def first_hit(
 
 @wp.kernel(enable_backward=False)
 def nearest(mesh: wp.uint64, points: wp.array[wp.vec3], farthest: float, face: wp.array[int], weights: wp.array[wp.vec3]):
-    """The triangle that holds the point of the mesh nearest to each place, and the weights of its corners."""
+    """The triangle nearest to each point, -1 for none, and the weights of its corners."""
     i = wp.tid()
     hit = wp.mesh_query_point_no_sign(mesh, points[i], farthest)
     face[i] = -1

@@ -1,4 +1,4 @@
-"""A scene -> a capture folder and its truth: settle, simulate, certify, place cameras, render, pass through the sensor."""
+"""Write the capture folder and the truth of a scene: settle, simulate, certify, place cameras, render, add sensor noise."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from neuspring.scenes.render import SKIN_COLOR, Part, Renderer, looking, measure
 
 FRAME_RATE = 30.0
 DEPTH_UNIT = 0.001
-"""m, as the cameras of the PhysTwin data."""
+"""m per count, as in the PhysTwin data."""
 FIELD_OF_VIEW = 55.0
 """Degrees, along the width."""
 AZIMUTHS = (-35.0, 85.0, 205.0)
 """Directions of the cameras around the object, degrees. The first camera looks at the object's head."""
 CAMERA_ELEVATION = 38.0
 SENSOR_SEED = 0
-"""Seed of the noise of the depth sensor; the scenario's name enters too."""
+"""Seed of the sensor's noise, combined with the scenario's name."""
 IMAGE_MARGIN = 0.9
-"""Object and hands' origins stay within this fraction of the image, from its center."""
+"""The object and the origins of the hands stay within this fraction of the image, measured from its center."""
 ANNOTATED_TRACKS = 40
 """Number of tracks for scoring."""
 LEAST_JACOBIAN, CRUSHED_SHARE = 0.02, 0.1
-"""A clip is refused if an element falls below this volume ratio in more than this fraction of the frames."""
+"""A clip is rejected if an element falls below this volume ratio in more than this fraction of the frames."""
 ENGINES = {"": FiniteElements, "vbd": VertexBlockDescent}
 MOST_DEVIATION = 0.001
-"""m. A clip is refused if twice the substeps move the mean node farther than this and than CHAOS times the effect of a nudge."""
+"""m. A clip is rejected if twice the substeps move the mean node by more than this and CHAOS times the effect of a nudge."""
 CHAOS = 3.0
-"""If a nudge of the start moves the clip nearly as far, the motion is chaotic and the time step is not too long."""
+"""If a nudge of the start moves the clip nearly as far, the motion is chaotic, and the time step is not too long."""
 GRAINS = {"cloth": (45.0, 0.5), "rope": (70.0, 0.5), "package": (35.0, 0.5)}
 """Frequency, 1/m, and contrast of the fine texture by category."""
 PLUSH_GRAIN, HAND_GRAIN = (36.0, 1.1), (45.0, 0.6)
@@ -58,7 +58,7 @@ class CaptureSize:
     width: int
     height: int
     mesh: float
-    """Spacing of finite-element nodes of a plush animal, m; other bodies scale it."""
+    """Spacing of the finite-element nodes of a plush animal, m; other bodies scale it."""
     skin: float
     """Spacing of visible vertices, m."""
 
@@ -72,18 +72,18 @@ SIZES = {
 
 
 def write_capture(row: ScenarioRow, path: Path, config: Config, folder: Path) -> None:
-    """See `neuspring.scenes.sources`. Says how far the clip can be trusted."""
+    """See `neuspring.scenes.sources`. Prints the accuracy of the clip."""
     _, truth = make(row, config.section(Synthetic), folder)
-    moved = f"{1e3 * truth.certificate:.2g} mm by twice as many, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
+    moved = f"{1e3 * truth.certificate:.2g} mm by twice the substeps, {1e3 * truth.sensitivity:.2g} mm by a start 1 um off"
     energy = truth.kinetic[-1] + truth.potential[-1]
-    print(f"{row.scenario}: {truth.substeps} substeps per frame; mean node moved {moved}", flush=True)
-    print(f"{row.scenario}: smallest det F {truth.least_jacobian.min():.2f}; energy at the end {energy:.3f} J", flush=True)
+    print(f"{row.scenario}: {truth.substeps} substeps per frame; the mean node moves {moved}", flush=True)
+    print(f"{row.scenario}: smallest det F {truth.least_jacobian.min():.2f}; final energy {energy:.3f} J", flush=True)
 
 
 def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, Truth]:
-    """Write the capture of scene `row.path` to `folder` and its truth beside it; returns both. Deterministic.
+    """Write the capture of scene `row.path` to `folder` and its truth next to it, and return both. Deterministic.
 
-    Raises InputError for an unknown scene, NumericalFailure for a clip that must not be shipped.
+    Raises InputError for an unknown scene, and NumericalFailure for a clip that is crushed or not converged.
     """
     engine_name, _, name = row.path.rpartition("/")
     if name not in SCENES or engine_name not in ENGINES:
@@ -95,7 +95,7 @@ def make(row: ScenarioRow, settings: Synthetic, folder: Path) -> tuple[Capture, 
     start = settle(body, FRAME_RATE)
     hands = scene.hands(start, scene.frames / FRAME_RATE)
     if engine_name and (body.is_sheet or any(hand.kind == "fist" for hand in hands)):
-        rule = "the held-out engine has solids that hands grip, no cloths and no pushes"
+        rule = "the held-out engine supports only solids that hands grasp, not cloths or pushes"
         raise InputError(f"scenario {row.scenario}, path", rule, repr(row.path))
     engine = ENGINES[engine_name](body, hands, frames, FRAME_RATE, Damping(), start=start)
     clip = engine.run()
@@ -152,12 +152,12 @@ def _refuse(name: str, truth: Truth) -> None:
     if crushed > CRUSHED_SHARE:
         raise NumericalFailure(f"{name}: an element is crushed (det F < {LEAST_JACOBIAN}) in {crushed:.0%} of the frames")
     if truth.certificate > max(MOST_DEVIATION, CHAOS * truth.sensitivity):
-        deviations = f"{1e3 * truth.certificate:.2f} mm, a start that is 1 um off by {1e3 * truth.sensitivity:.2f} mm"
-        raise NumericalFailure(f"{name}: twice the substeps move the mean node by {deviations}; not converged")
+        deviations = f"{1e3 * truth.certificate:.2f} mm, a start 1 um off by {1e3 * truth.sensitivity:.2f} mm"
+        raise NumericalFailure(f"{name}: not converged; twice the substeps move the mean node by {deviations}")
 
 
 def place_cameras(clip: Clip, hands: Sequence[Hand], size: CaptureSize) -> list[Camera]:
-    """Cameras around the object, as near as the motion of object and hands allows, so that they fill the image."""
+    """Cameras around the object, as near as possible while the moving object and hands stay in the image."""
     focal = 0.5 * size.width / np.tan(np.radians(FIELD_OF_VIEW / 2))
     k = np.array([[focal, 0.0, (size.width - 1) / 2], [0.0, focal, (size.height - 1) / 2], [0.0, 0.0, 1.0]])
     times = np.arange(len(clip.positions)) / FRAME_RATE
@@ -214,11 +214,11 @@ def _film(
 
 MARK_LABELS = {OBJECT: "object", HANDS: "hand"}
 BORDER_OFF = 1.0
-"""Pixels by which the border of a mark may be off, and by which its corners are rounded."""
+"""Pixels. Tolerance of an annotation's border, and of the polygon that approximates it."""
 
 
 def outlines(capture: Capture) -> dict[str, list[dict[str, Any]]]:
-    """Polygons around object and hands in frame 0 of each camera, as perception.marks reads them."""
+    """Polygons around object and hands in frame 0 of each camera, in the format of perception.marks."""
     import cv2
 
     cameras: dict[str, list[dict[str, Any]]] = {name: [] for name in capture.cameras}
@@ -227,14 +227,14 @@ def outlines(capture: Capture) -> dict[str, list[dict[str, Any]]]:
         for label, word in MARK_LABELS.items():
             for contour in cv2.findContours((mask == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
                 points = cv2.approxPolyDP(contour, BORDER_OFF, closed=True)[:, 0].tolist()
-                # What is thinner than the rounding has no polygon.
+                # Parts thinner than the tolerance have no polygon.
                 kind = "polygon" if len(points) > 2 else "scribble"
                 marks.append({"frame": 0, "label": word, "kind": kind, "points": points, "radius": BORDER_OFF})
     return cameras
 
 
 def _annotate(truth: Truth, camera: Camera, capture: Capture) -> np.ndarray:
-    """Tracks [T, K, 3], m, of well spread vertices that `camera` sees in frame 0."""
+    """Tracks [T, K, 3], m, of evenly spread vertices that `camera` sees in frame 0."""
     vertices = truth.surface(0)
     pixels, depth = camera.project(vertices)
     inside = np.flatnonzero(camera.sees(pixels))

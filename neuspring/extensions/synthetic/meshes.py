@@ -1,6 +1,6 @@
-"""Meshes of bodies: tetrahedra of implicit bodies (body-centered lattice, boundary snapped to the surface), boxes and sticks.
+"""Tetrahedral meshes: implicit shapes (body-centered lattice, boundary snapped to the surface), boxes and sticks.
 
-Meshes are (nodes [N, 3] m, tetrahedra [E, 4] with positive volume).
+A mesh is (nodes [N, 3], m, tetrahedra [E, 4] with positive volume).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neuspring.scenes.shapes import Sdf, gradient, grid
 LATTICE_ALTITUDE = np.sqrt(0.5)
 """Altitude of a tetrahedron of the body-centered lattice, in lattice constants."""
 LEAST_ALTITUDE = 0.4
-"""Snapping never takes a tetrahedron below this fraction of the lattice's altitude."""
+"""Snapping keeps every tetrahedron above this fraction of the lattice's altitude."""
 SNAPPING_STEPS = 40
 EMBEDDING_CANDIDATES = 12
 
@@ -43,7 +43,7 @@ def altitudes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def oriented(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """The tetrahedra with two corners exchanged where the volume is negative."""
+    """The tetrahedra, with two corners swapped where the volume is negative."""
     tetrahedra = tetrahedra.copy()
     inverted = volumes(nodes, tetrahedra) < 0
     tetrahedra[inverted] = tetrahedra[inverted][:, [0, 1, 3, 2]]
@@ -51,7 +51,7 @@ def oriented(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def boundary(tetrahedra: np.ndarray) -> np.ndarray:
-    """Faces [F, 3] that belong to one tetrahedron only, outward."""
+    """Faces [F, 3] that belong to only one tetrahedron, oriented outward."""
     corners = [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]
     faces = np.concatenate([tetrahedra[:, c] for c in corners])
     _, inverse, counts = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -66,7 +66,7 @@ def edges(elements: np.ndarray) -> np.ndarray:
 
 
 def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
-    """Tetrahedra of the body-centered cubic lattice that covers a box: two cell centers and an edge of the face between them."""
+    """Tetrahedra of the body-centered cubic lattice over a box: two cell centers, and an edge of the face between them."""
     first = np.asarray(low, float) - spacing
     corners = np.ceil((np.asarray(high, float) + spacing - first) / spacing).astype(int) + 1
     cells = corners - 1
@@ -88,11 +88,11 @@ def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh
 
 
 def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) -> Mesh:
-    """Tetrahedra of the inside of `sdf`: lattice cells with their centroid inside, largest piece, boundary moved to the surface.
+    """Tetrahedra inside `sdf`: lattice cells whose centroid is inside, largest piece, boundary moved to the surface.
 
-    The boundary follows -grad(sdf) with smoothing; a move that would take a tetrahedron's altitude below LEAST_ALTITUDE of the
-    lattice's is shortened. Altitude and not a scale-free quality, because cells that shrink evenly keep their quality and ruin
-    the time step.
+    The boundary follows -grad(sdf) with smoothing. A move is shortened if it would reduce a tetrahedron's altitude below
+    LEAST_ALTITUDE times that of the lattice. A scale-free quality would not suffice: cells that shrink evenly keep it, but they
+    require a small time step.
     """
     nodes, tetrahedra = lattice(low, high, spacing)
     tetrahedra = tetrahedra[sdf(nodes[tetrahedra].mean(axis=1)) < -0.05 * spacing]
@@ -116,7 +116,7 @@ def fill(sdf: Sdf, low: Sequence[float], high: Sequence[float], spacing: float) 
 
 
 def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nominal: float) -> np.ndarray:
-    """Fraction of the move [N] that every node may make."""
+    """Admissible fraction [N] of each node's move."""
     allowed = np.minimum(LEAST_ALTITUDE, altitudes(nodes, tetrahedra) / nominal)
     fraction = np.ones(len(nodes))
     for attempt in range(10):
@@ -128,7 +128,7 @@ def _admissible(nodes: np.ndarray, tetrahedra: np.ndarray, move: np.ndarray, nom
 
 
 def pieces(tetrahedra: np.ndarray) -> np.ndarray:
-    """[E] the piece of each tetrahedron; neighbors share a face."""
+    """Connected piece of each tetrahedron [E]; neighbors share a face."""
     faces = np.sort(np.concatenate([tetrahedra[:, c] for c in FACES]), axis=1)
     owner = np.tile(np.arange(len(tetrahedra)), 4)
     order = np.lexsort(faces.T)
@@ -143,14 +143,14 @@ def _adjacency(pairs: np.ndarray, count: int) -> csr_matrix:
 
 
 def _averaging(elements: np.ndarray, count: int) -> csr_matrix:
-    """The matrix that replaces each node by the mean of its neighbors."""
+    """Matrix [N, N] that replaces each node by the mean of its neighbors."""
     graph = _adjacency(edges(elements), count)
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)
     return coo_matrix(graph.multiply(1.0 / degree[:, None])).tocsr()
 
 
 def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray, cells: Sequence[int]) -> Mesh:
-    """A box of regular cells, five tetrahedra each, mirrored from cell to cell so that faces agree."""
+    """A box of regular cells with five tetrahedra each, mirrored from cell to cell so that faces match."""
     counts = np.asarray(cells)
     first, last = np.asarray(low, float), np.asarray(high, float)
     nodes = (first + grid(counts + 1) * (last - first) / counts).reshape(-1, 3)
@@ -173,8 +173,11 @@ def block(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray,
 
 
 def stick(length: float, radii: np.ndarray, around: int) -> Mesh:
-    """A stick along x, centered: `radii` [n + 1] at equal steps, a node on the axis and `around` nodes on each ring, three
-    tetrahedra per prism, split by node order so that neighbors agree."""
+    """A stick along x, centered at the origin, with `radii` [n + 1], m, at equal steps.
+
+    Each cross section has a node on the axis and `around` nodes on a ring. Each prism has three tetrahedra; the node order
+    determines the split, so that neighbors match.
+    """
     along = np.linspace(-length / 2, length / 2, len(radii))
     angles = 2 * np.pi * np.arange(around) / around
     ring = np.stack([np.zeros(around), np.cos(angles), np.sin(angles)], axis=1)
@@ -192,7 +195,7 @@ def stick(length: float, radii: np.ndarray, around: int) -> Mesh:
 
 
 def embed(points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each point's tetrahedron [V] and barycentric weights [V, 4]; slightly negative where a point lies outside all of them."""
+    """Each point's tetrahedron [V] and barycentric weights [V, 4]; weights are slightly negative for points outside the mesh."""
     candidates = cKDTree(nodes[tetrahedra].mean(axis=1)).query(points, k=EMBEDDING_CANDIDATES)[1]
     best = np.full(len(points), -np.inf)
     element, weights = np.zeros(len(points), dtype=int), np.zeros((len(points), 4))
@@ -200,9 +203,9 @@ def embed(points: np.ndarray, nodes: np.ndarray, tetrahedra: np.ndarray) -> tupl
         corners = nodes[tetrahedra[candidate]]
         basis = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
         inner = np.linalg.solve(basis, (points - corners[:, 0])[..., None])[..., 0]
-        own = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
-        better = own.min(axis=1) > best
-        best[better], element[better], weights[better] = own.min(axis=1)[better], candidate[better], own[better]
+        trial = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+        better = trial.min(axis=1) > best
+        best[better], element[better], weights[better] = trial.min(axis=1)[better], candidate[better], trial[better]
     return element, weights
 
 

@@ -1,7 +1,7 @@
-"""The 22 scenes: which body, how many frames, and what the hands do.
+"""The 22 scenes: their bodies, frame counts and hand motions.
 
-Names, categories and frame counts are those of the PhysTwin data; bodies, materials and motions are ours. Hands are rigid meshes
-that follow key frames, hold what they grasp, or push. A hand's origin is where its fingers meet.
+Names, categories and frame counts are those of the PhysTwin data; bodies, materials and motions are our own. Hands are rigid meshes
+that follow key frames; they hold what they grasp, or push. The origin of a hand is the point at which its fingers meet.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ KeyFrame = tuple[float, Sequence[float], Sequence[float]]
 
 @dataclass(frozen=True)
 class Hand:
-    """A hand's motion and what it does. `grip` holds nodes within `reach` of its origin from frame 0 on; `fist` pushes."""
+    """The motion of a hand. A `grip` holds the nodes within `reach` of its origin from frame 0 on; a `fist` pushes."""
 
     keys: tuple[KeyFrame, ...]
     kind: Literal["grip", "fist"] = "grip"
     reach: float = 0.02
     """m."""
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Orientation of the mesh in the hand's frame: rotation vector, rad. Physics does not see it."""
+    """Orientation of the mesh in the hand's frame: rotation vector, rad. It does not affect physics."""
 
     def poses(self, times: np.ndarray) -> np.ndarray:
         """Position and quaternion (x, y, z, w) [n, 7] at `times`, s: minimum jerk from key to key."""
@@ -56,7 +56,7 @@ class Hand:
 
 
 def minimum_jerk(fraction: np.ndarray) -> np.ndarray:
-    """u^3 (10 - 15 u + 6 u^2), clipped to [0, 1]: starts and ends without velocity and acceleration."""
+    """u^3 (10 - 15 u + 6 u^2), with u clipped to [0, 1]: velocity and acceleration are zero at both ends."""
     u = np.clip(fraction, 0.0, 1.0)
     return np.asarray(u**3 * (10.0 - 15.0 * u + 6.0 * u * u))
 
@@ -79,25 +79,25 @@ def _grip() -> Sdf:
 
 
 MEAN_SPEED = 0.2
-"""m/s of a hand on its way; the peak of minimum-jerk motion is 1.875 times as fast."""
+"""m/s. Mean speed of a hand between key frames; minimum-jerk motion peaks at 1.875 times this speed."""
 Offsets = Sequence[Sequence[float] | np.ndarray]
 
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """A body, how long it is filmed, and its hands for a settled shape."""
+    """A body, its number of frames, and its hands."""
 
     body: Callable[[float, float], SoftBody]
-    """Mesh spacing and skin spacing, m, in parts of the size's own (see `CaptureSize`)."""
+    """Mesh spacing and skin spacing of the size (see `CaptureSize`), m -> body, which scales them."""
     frames: int
     hands: Callable[[np.ndarray, float], tuple[Hand, ...]]
     """Settled nodes [N, 3], m, and duration, s -> hands."""
     marked: bool = False
-    """True where its capture has marks of frame 0, as a careful user draws them: its colors are the table's."""
+    """True if the capture contains annotations of frame 0, as a careful user draws them: object and table have the same colors."""
 
 
 def wander(start: np.ndarray, offsets: Offsets, duration: float) -> tuple[KeyFrame, ...]:
-    """Key frames that visit start + offset in turn, again and again, at MEAN_SPEED, until `duration` is over."""
+    """Key frames that visit start + offset in turn, repeatedly, at MEAN_SPEED, until `duration`, s, is over."""
     keys = [(0.0, tuple(start), (0.0, 0.0, 0.0))]
     now, here, k = 0.0, np.asarray(start, float), 0
     while now < duration:
@@ -116,27 +116,27 @@ def nearest(nodes: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
 
 LIFT = ((0, 0, 0.16), (-0.05, 0.06, 0.18), (0.04, -0.06, 0.14), (0, 0.03, 0.2), (0.03, 0.02, 0.09), (0, 0, 0.03))
 TOGETHER = ((0, 0, 0.14), (-0.015, 0.06, 0.17), (0.015, -0.06, 0.13), (0, 0.03, 0.18), (0.01, 0.02, 0.08), (0, 0, 0.03))
-"""Two hands at the ends of one animal must not crush it."""
+"""Offsets for two hands at the ends of an animal, which must not crush it."""
 LOW_LIFT = ((0, 0, 0.1), (-0.03, 0.05, 0.11), (0.03, -0.04, 0.06), (0, 0, 0.12))
 
 
 def lift(*places: Sequence[float], reach: float = 0.02, offsets: Offsets = LIFT, turn: Sequence[float] = (0, 0, 0)) -> Callable:
-    """A grip at each place (parts of the bounding box); several move together, out of step by one offset."""
+    """One grip at each of `places`, in fractions of the bounding box; every second grip mirrors the offsets along x."""
 
     def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
         grips = []
         for k, wanted in enumerate(places):
             point = nearest(nodes, wanted)
-            # The hands of one object take the same heights, not the same detours.
-            own = [(x * (1 - 2 * (k % 2)), y, z) for x, y, z in offsets]
-            grips.append(Hand(wander(point, own, duration), reach=reach, turn=tuple(turn)))  # type: ignore[arg-type]
+            # The hands of one object move to the same heights, but sideways in opposite directions.
+            mirrored = [(x * (1 - 2 * (k % 2)), y, z) for x, y, z in offsets]
+            grips.append(Hand(wander(point, mirrored, duration), reach=reach, turn=tuple(turn)))  # type: ignore[arg-type]
         return tuple(grips)
 
     return hands
 
 
 def stretch(first: Sequence[float], second: Sequence[float], pull: float) -> Callable:
-    """Two grips that lift the object and pull it apart along the line between them, again and again."""
+    """Two grips that lift the object and pull it repeatedly along the line between them, by `pull` m each."""
 
     def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
         points = [nearest(nodes, wanted) for wanted in (first, second)]
@@ -153,7 +153,7 @@ def stretch(first: Sequence[float], second: Sequence[float], pull: float) -> Cal
 
 
 def push(place: Sequence[float], direction: Sequence[float], distance: float) -> Callable:
-    """A fist beside the object that pushes it along the table, there, half back, and on."""
+    """A fist next to the object that pushes it along the table by `distance` m, moves back, and pushes farther."""
 
     def hands(nodes: np.ndarray, duration: float) -> tuple[Hand, ...]:
         point, along = nearest(nodes, place), np.asarray(direction, float)

@@ -1,4 +1,4 @@
-"""What the registries of sources and trackers hold of synthetic scenes."""
+"""Entries of synthetic scenes in the registries of sources and trackers."""
 
 from __future__ import annotations
 

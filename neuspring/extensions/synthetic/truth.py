@@ -1,7 +1,7 @@
-"""The truth of a synthetic capture, which methods may not read: motion of every node, correspondences, materials, contact; and
-where the material at a place of frame 0 goes, to judge perception by.
+"""The truth of a synthetic capture, which methods must not read: motion of every node, correspondences, materials, contact.
 
-It lies beside the capture's folder, and the capture's provenance holds its digest.
+`under_pixels` and `at_points` give the motion of material points, with which perception is measured. The file is next to the
+capture's folder, and the capture's provenance contains its digest.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ class Truth(Artifact):
     potential: np.ndarray = array("T", np.float32, "J", "potential energy")
     least_jacobian: np.ndarray = array("T", np.float32, "1", "smallest det F of an element")
     substeps: int
-    """Per frame."""
+    """Substeps per frame."""
     certificate: float
-    """Mean distance of nodes to the same clip with twice the substeps, m, in the worst frame."""
+    """Mean distance of nodes from the same clip with twice the substeps, m, in the worst frame."""
     sensitivity: float
-    """Mean distance of nodes to the same clip from a start that is a micrometer off, m, in the worst frame. No time step can
-    predict the motion better."""
+    """Mean distance of nodes from the same clip with a start that is 1 um off, m, in the worst frame.
+
+    No time step can predict the motion better."""
 
     def surface(self, frame: int) -> np.ndarray:
         """Visible vertices [V, 3], m, in one frame."""
@@ -56,40 +57,40 @@ class Truth(Artifact):
 
 
 def truth_path(folder: Path) -> Path:
-    """The place where the truth of the capture in `folder` lies."""
+    """The path of the truth of the capture in `folder`."""
     folder = Path(folder).resolve()
     return folder.with_name(f"{folder.name}_truth.npz")
 
 
 def truth_of(capture: Capture) -> Truth:
-    """The truth of a synthetic capture. Raises InputError if there is none, or another capture's."""
+    """Load the truth of a synthetic capture. Raises InputError if there is none, or if it belongs to another capture."""
     path = truth_path(capture.folder)
     if not path.is_file():
-        remedy = "Only synthetic scenes have one; choose other backends of perception.track and perception.shape."
-        raise InputError(path, "this needs the truth of a synthetic scene", "no such file", remedy)
+        remedy = "Only synthetic scenes have a truth: choose other backends of perception.track and perception.shape."
+        raise InputError(path, "the truth of a synthetic scene is required", "no such file", remedy)
     if capture.description.provenance.get("truth") != f"sha256:{digest_file(path)}":
         rule = f"must be the truth that {capture.folder / CAPTURE} names"
-        raise InputError(path, rule, "another capture's", "Delete both and make the capture again.")
+        raise InputError(path, rule, "that of another capture", "Delete both, and make the capture again.")
     return Truth.load(path)
 
 
 FARTHEST_TRUTH = 8.0
-"""m."""
+"""m. Largest distance of a queried point from the mesh, or along a ray."""
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialPoints:
-    """Points of the visible surface, each in a triangle."""
+    """Points of the visible surface, each bound to a triangle."""
 
     truth: Truth
     face: np.ndarray
-    """[Q], -1 where there is none."""
+    """[Q] index of the triangle, -1 for none."""
     weights: np.ndarray
-    """[Q, 3] of the triangle's corners."""
+    """[Q, 3] weights of the triangle's corners."""
 
     @cached_property
     def places(self) -> np.ndarray:
-        """[T, Q, 3], m, over time."""
+        """Positions [T, Q, 3], m, over time."""
         corners = self.truth.surface_faces[np.maximum(self.face, 0)]
         frames = range(len(self.truth.nodes))
         return np.stack([np.einsum("qk,qkc->qc", self.weights, self.truth.surface(frame)[corners]) for frame in frames])
@@ -98,7 +99,7 @@ class MaterialPoints:
 def under_pixels(truth: Truth, camera: Camera, pixels: np.ndarray) -> MaterialPoints:
     """Surface points under the `pixels` (x, y) [Q, 2] in frame 0.
 
-    Hands are not looked at: a pixel that shows a hand gets the object behind it. Choose pixels by the capture's masks.
+    Hands are ignored: a pixel that shows a hand gets the object behind it. Use the capture's masks to choose pixels.
     """
     origin = camera.camera_to_world[:3, 3]
     rays = camera.rays(pixels)

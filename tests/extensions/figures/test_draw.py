@@ -71,12 +71,12 @@ def test_frames_of_splats_are_pictures_of_any_camera(video, tmp_path):
 @pytest.mark.parametrize(
     ("of", "words", "text"),
     [
-        ("plain", ["strip", "--methods", "phystwin"], "has the methods neuspring, baseline; received phystwin. Name METHOD"),
-        ("plain", ["strip", "--frames", "0", "8"], "--frames: the scenario has the frames 0 to 7; received 8"),
-        ("plain", ["strip", "--camera", "1"], "--camera: must be a camera of the capture: there is none; received 1"),
-        ("plain", ["strip", "--as", "splats"], "received none for neuspring/0; baseline/0. Leave out"),
-        ("plain", ["strip", "--error", "color"], "needs splats, and photos with masks of the same camera; received nodes"),
-        ("plain", ["strip", "--labels", "one"], "--labels: one name for each of 2 methods is required; received 1"),
+        ("plain", ["strip", "--methods", "phystwin"], "neuspring, baseline; received phystwin. Enter METHOD"),
+        ("plain", ["strip", "--frames", "0", "8"], "--frames: must be 0 to 7, the frames of the scenario; received 8"),
+        ("plain", ["strip", "--camera", "1"], "--camera: must be a camera of the capture (it has none); received 1"),
+        ("plain", ["strip", "--as", "splats"], "received none for neuspring/0; baseline/0. Remove"),
+        ("plain", ["strip", "--error", "color"], "requires splats, and photos with masks of the same camera; received nodes"),
+        ("plain", ["strip", "--labels", "one"], "--labels: must have one name for each of 2 methods; received 1"),
         ("plain", ["strip", "--most", "-1"], "--most: must be 1e-06 to 1e+06"),
         ("plain", ["strip", "--elevation", "91"], "--elevation: must be -89 to 89 degrees; received 91"),
         ("plain", ["strip", "--dpi", "nan"], "--dpi: must be 50 to 1200; received nan"),
@@ -87,9 +87,9 @@ def test_frames_of_splats_are_pictures_of_any_camera(video, tmp_path):
         ),
         ("plain", ["film", "--width", "40", "--output", "film.gif"], "--width: must be 160 to 1920; received 40"),
         ("plain", ["film", "--megabytes", "nan", "--output", "film.gif"], "--megabytes: must be 0.001 to 100"),
-        ("plain", ["twin", "--as", "splats"], "Leave out --as splats to draw springs"),
-        ("video", ["strip", "--camera", "9"], "must be a camera of the capture: 0; received 9"),
-        ("video", ["strip", "--camera", "0", "--azimuth", "20"], "--camera: excludes --azimuth and --elevation"),
+        ("plain", ["twin", "--as", "splats"], "Remove --as splats to draw springs"),
+        ("video", ["strip", "--camera", "9"], "must be a camera of the capture (0); received 9"),
+        ("video", ["strip", "--camera", "0", "--azimuth", "20"], "--camera: cannot be combined with --azimuth and --elevation"),
         ("video", ["strip", "--azimuth", "20", "--error", "color"], "received camera view without photos or masks"),
     ],
 )
@@ -128,6 +128,6 @@ def test_a_damaged_splat_file_and_a_missing_folder(video, tmp_path, capsys):
     assert "none for neuspring/0, no splats: " in capsys.readouterr().err
     # Without the wish for splats nodes are drawn, and the reason is told.
     assert main(["draw", "strip", str(scenario), "--dpi", "60", *output]) == 0
-    assert "Nodes are drawn, since there are no splats for neuspring/0" in capsys.readouterr().out
+    assert "Drawing nodes, because there are no splats for neuspring/0" in capsys.readouterr().out
     assert main(["draw", "strip", str(tmp_path / "nowhere"), *output]) == 2
     assert "or a run <scenario>/<method>/<seed>; received no such folder" in capsys.readouterr().err

@@ -71,7 +71,7 @@ def test_a_film_that_is_too_large_is_made_coarser_or_refused(video, tmp_path):
     small = write_film(paints, tmp_path / "small.gif", 240, megabytes=limit)
     assert small.bytes <= 1e6 * limit and small.coarser and not whole.coarser and "coarser" in str(small)
     assert len(gif(tmp_path / "small.gif")[0]) == small.frames
-    with pytest.raises(InputError, match=r"the coarsest film has .* Name fewer --frames or methods, or write \.mp4"):
+    with pytest.raises(InputError, match=r"the size of the smallest video.* Reduce --frames or --methods, or write \.mp4"):
         write_film(paints, tmp_path / "none.gif", 240, megabytes=1e-5)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["small.gif", "whole.gif"]
 

@@ -79,7 +79,7 @@ def test_a_frame_that_a_camera_missed_and_one_behind_a_divergence_say_so(tmp_pat
     paints = PhotoPainter(paints.scene, [paints.takes[0], short], (0, 4), paints.manner, "cpu")
     panels = grid(strip_figure(paints, 6.0), 5, 2)
     words = [[text.get_text() for text in axis.texts] for axis in panels[:, 1]]
-    assert words == [["camera 0 missed it"], [], ["no picture"], ["diverged"], []]
+    assert words == [["camera 0: no image"], [], ["no image"], ["diverged"], []]
 
 
 def test_splats_that_a_method_moves_itself_are_where_it_puts_them(video):

@@ -81,7 +81,7 @@ def test_compressed_images_and_packed_depth(tmp_path):
         np.testing.assert_array_equal(pair[0], color)
         np.testing.assert_array_equal(pair[1], counts(depth))
     for topics, words in (
-        (("/a/compressed", "/float/compressedDepth"), r"topics of color and depth that are read.*depth /depth/compressedDepth"),
+        (("/a/compressed", "/float/compressedDepth"), r"a color and a depth topic are required.*depth /depth/compressedDepth"),
         (("/a/compressed", "/gone"), "received /a/compressed /gone"),
         (("/a/compressed",), "pairs COLOR DEPTH are required"),
     ):
@@ -96,7 +96,7 @@ def test_compressed_images_and_packed_depth(tmp_path):
         ({"d": np.array([0.1, 0.0, 0.0, 0.0, 0.0])}, ("opencv", 5)),
         ({"d": np.full(4, 0.1), "distortion_model": "equidistant"}, ("fisheye", 4)),
         ({"d": np.full(5, 0.1), "distortion_model": "inverse_brown_conrady"}, ("inverse_brown_conrady", 5)),
-        ({"binning_x": 2}, "whole images without binning"),
+        ({"binning_x": 2}, "full images without binning"),
         ({"matrix": np.zeros((3, 3))}, None),
     ],
 )

@@ -27,7 +27,7 @@ def test_frames_are_cut_out_with_their_masks_tracks_and_gaps(tmp_path):
 
 @pytest.mark.parametrize(
     ("first", "last", "message"),
-    [(3, 12, "five frames or more of 0 to 11.*received 3-12"), (3, 6, "received 3-6"), (5, 9, "camera b must have the first")],
+    [(3, 12, "at least five frames of 0 to 11.*received 3-12"), (3, 6, "received 3-6"), (5, 9, "camera b must have the first")],
 )
 def test_frames_that_make_no_capture_are_not_cut(tmp_path, first, last, message):
     whole = write(tmp_path / "whole", describe(frame_count=12, cameras=(entry("a"), entry("b", missing=(5,)))))
@@ -44,5 +44,5 @@ def test_a_capture_is_cut_with_its_hands_and_nodes(tmp_path):
     np.testing.assert_allclose(read(part).hands.points, scene.risen(scene.GRIP, 6))
     assert len(read(part).nodes) == len(scene.NODES)
     assert len(read(part).rest) == 56
-    with pytest.raises(InputError, match=r"nodes\.npz.*frame 0.*a cut must begin; received frame 1"):
+    with pytest.raises(InputError, match=r"nodes\.npz.*frame 0.*the cut must start there; received frame 1"):
         cut(original, 1, 6, tmp_path / "later")

@@ -106,7 +106,7 @@ def test_a_board_gives_the_poses(tmp_path):
             cv2.imwrite(str(path), board_image(pose))
     rig = {"frame_rate": 30, "poses": "board", "board": BOARD, "cameras": [BIG, BIG | {"board_images": "color_1"}]}
     intake = {"category": "cloth", "color": (tmp_path / "color_0", tmp_path / "color_1")}
-    with pytest.raises(InputError, match="none is for one camera"):
+    with pytest.raises(InputError, match="none allows only one camera"):
         make_capture(Intake(output=tmp_path / "two", rig=write_json(tmp_path / "rig.json", rig), **intake))
     for index, pose in enumerate(poses):
         one = write_json(tmp_path / f"{index}.json", rig | {"cameras": rig["cameras"][index : index + 1]})
@@ -148,7 +148,7 @@ def test_an_interrupted_call_resumes_and_work_of_people_is_never_replaced(desk, 
         patch.setattr(make.Writer, "frame", stops)
         with pytest.raises(KeyboardInterrupt):
             make_capture(intake)
-    with pytest.raises(InputError, match="a whole capture is required"):
+    with pytest.raises(InputError, match="a complete capture is required"):
         Capture.load(intake.output)
     with pytest.raises(InputError, match="an unfinished capture from other input"):
         make_capture(given(desk, tmp_path, frames="0-5"))
@@ -159,7 +159,7 @@ def test_an_interrupted_call_resumes_and_work_of_people_is_never_replaced(desk, 
     with pytest.raises(InputError, match=r"must be a new or empty folder; received a capture.*--force"):
         make_capture(intake)
     (capture.folder / "mask").mkdir()
-    with pytest.raises(InputError, match=r"--force does not remove masks.*Move them away"):
+    with pytest.raises(InputError, match=r"--force does not remove masks.*Move these files"):
         make_capture(given(desk, tmp_path, force=True))
     (capture.folder / "mask").rmdir()
     assert make_capture(given(desk, tmp_path, frames="0-5", force=True))[0].frame_count == 6
@@ -193,7 +193,7 @@ def test_a_raw_case_is_converted_with_frames_that_a_camera_misses(tmp_path):
     metadata = json.loads((case / "metadata.json").read_text())
     for change, words in (
         ({"fps": None}, "fps or record_hz: a positive number"),
-        ({"record_hz": 29}, "fps or record_hz: a positive number .* one for all cameras"),
+        ({"record_hz": 29}, "fps or record_hz: a positive number .* the same for all cameras"),
         ({"WH": [64]}, "WH: two positive"),
         ({"frame_num": 1}, "frame_num"),
     ):
@@ -205,7 +205,7 @@ def test_a_raw_case_is_converted_with_frames_that_a_camera_misses(tmp_path):
     np.save(case / "depth" / "0" / "0.npy", np.zeros((90, 160), np.float32))
     with pytest.raises(InputError, match=r"0\.npy: depth must be 16-bit counts; received float32.*depth_scale_m_per_unit"):
         make_capture(Intake(output=tmp_path / "float", category="toy", recording=(case,)))
-    with pytest.raises(InputError, match="one case of PhysTwin's raw layout is required, alone; received --frames"):
+    with pytest.raises(InputError, match="exactly one case, without other options, is required; received --frames"):
         make_capture(Intake(output=tmp_path / "part", category="toy", recording=(case,), frames="0-4"))
 
 
@@ -229,7 +229,7 @@ def test_points_without_color_become_a_capture(tmp_path):
     assert made.streams == set() and serious(check_layout(made.folder)) == []
     np.testing.assert_allclose(read(made).hands.points, scene.risen(scene.GRIP, 8))
     assert made.description.provenance["nodes file"].startswith("sha256:")
-    with pytest.raises(InputError, match="Move them away"):
+    with pytest.raises(InputError, match="Move these files"):
         make_capture(of_points(tmp_path, force=True))
 
 
@@ -258,9 +258,9 @@ def test_a_sheet_that_leans_is_named_and_turned_below_its_hands(tmp_path, up):
         ({"nodes": None}, "points without color need --controllers, --nodes and --tracks; received no --nodes"),
         ({"up": None}, r"--up: is required.*State the axis that points up"),
         ({"rate": None}, r"--rate: rows per second are required"),
-        ({"up": "-z"}, r"tracks\.json: points: lowest height above the table.*state --up"),
-        ({"frames": "0-5"}, r"--frames: is for cameras.*a row is a frame"),
-        ({"pose": "standing"}, "--pose: is for cameras"),
+        ({"up": "-z"}, r"tracks\.json: points: lowest height above the table.*pass --up"),
+        ({"frames": "0-5"}, r"--frames: requires --color.*each row is a frame"),
+        ({"pose": "standing"}, "--pose: requires --color"),
     ],
 )
 def test_points_are_refused_before_anything_is_written(tmp_path, changes, words):

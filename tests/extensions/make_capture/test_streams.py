@@ -116,7 +116,7 @@ def test_frames_are_kept_by_number_and_a_camera_may_miss_some(desk):
     assert choose(views(desk), "", None, {"1": 2}).places["1"] == {k: k + 2 for k in range(5)}
     gap = choose(views(desk, missing=(3,)), "", "names", {})
     assert gap.missing("1") == (3,) and len(gap.places["1"]) == FRAMES - 1
-    with pytest.raises(InputError, match=r"camera 1 must have the first.*number 0.*first frame of all cameras is number 1"):
+    with pytest.raises(InputError, match=r"camera 1 must have the first.*number 0.*Start at number 1"):
         choose(views(desk, missing=(0,)), "", "names", {})
     with pytest.raises(InputError, match="at least 5 frames"):
         choose(views(desk), "2-4", None, {})
@@ -137,7 +137,7 @@ def test_ranges_of_frames():
         ({"color_primaries": 9, "color_trc": 18, "colorspace": 9}, r"HDR \(PQ or HLG\)", "tonemap"),
         ({"color_primaries": 9, "color_trc": 14, "colorspace": 9}, "colors of BT.2020", "p=bt709"),
         ({"sample_aspect_ratio": Fraction(4, 3)}, "pixels of 4/3", "setsar=1"),
-        ({}, "a mark by which players turn or flip it", "scale=WIDTH:HEIGHT"),
+        ({}, "a mark that makes players rotate or flip it", "scale=WIDTH:HEIGHT"),
     ],
 )
 def test_videos_of_other_kinds_are_refused_with_the_line_that_converts_them(desk, tmp_path, made, received, line):
@@ -155,7 +155,7 @@ def test_videos_of_other_kinds_are_refused_with_the_line_that_converts_them(desk
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda image: image * np.uint16(16), "use its range, 0 to 65535; received [1-4][0-9]{3}. .*12 bits by 16"),
+        (lambda image: image * np.uint16(16), "use its range, 0 to 65535; received at most [1-4][0-9]{3}. .*12 bits by 16"),
         (
             lambda image: np.dstack([image, 255 * (np.indices(image.shape[:2])[0] > 3)]).astype(np.uint8),
             "opaque; received .*alpha off",
@@ -185,7 +185,7 @@ def test_videos_are_paired_by_their_stamps_and_depth_must_be_exact(desk, tmp_pat
         np.testing.assert_array_equal(read, stored)
     with pytest.raises(InputError, match="a depth video must be gray with 16 bits"):
         _ = open_images(tmp_path / "color.mp4", "depth").series
-    with pytest.raises(InputError, match=r"a video track is required; the file has 1"):
+    with pytest.raises(InputError, match=r"a video track below 1 is required"):
         _ = open_images(tmp_path / "color.mp4#3", "color").series
     (tmp_path / "bad.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="readable video"):

@@ -1,11 +1,11 @@
-"""Formats of images and recordings: one file each, which recognizes a path and opens it.
+"""Formats of images and recordings; each file recognizes and opens one format.
 
-To add one: a file here with a `CaptureFormat` named capture_format, or a package's entry point of the group
-`neuspring.capture_formats`. A format has one of
+To add a format, write a file here with a `CaptureFormat` named capture_format, or declare an entry point of the group
+`neuspring.capture_formats` in a package. A format sets one of
 
-    pictures     color or depth of one camera (--color, --depth): a folder, a video
-    recording    streams of all cameras (--recording): a bag
-    capture      writes the capture itself (--recording): PhysTwin's raw layout
+    pictures     opens color or depth of one camera (--color, --depth), like a folder or a video
+    recording    opens the streams of all cameras (--recording), like a bag
+    capture      writes the capture itself (--recording), like PhysTwin's raw layout
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class CaptureFormat:
     """One format of images or recordings."""
 
     about: str
-    """Its name for messages; {kind} and {endings} stand for the kind of images and the endings of their files."""
+    """Name for messages; {kind} and {endings} are replaced by the kind of images and the endings of their files."""
     recognizes: Callable[[Path], bool]
     """True for a path of this format."""
     pictures: Callable[[Path, Kind], ImageSource] | None = None
     """Opens images of one kind. Raises InputError."""
     recording: Callable[[Intake], list[CameraStreams]] | None = None
-    """Opens --recording. Raises InputError."""
+    """Opens the streams of --recording. Raises InputError."""
     capture: Callable[[Intake], Capture] | None = None
     """Writes --recording as a capture. Raises InputError."""
 
@@ -46,33 +46,33 @@ FORMATS: Registry[CaptureFormat] = Registry("capture_formats", modules(__name__,
 
 
 def open_images(path: Path, kind: Kind) -> ImageSource:
-    """Color or depth of one camera. Raises InputError for a path of no format."""
+    """Open color or depth of one camera. Raises InputError for an unknown format."""
     for format_ in FORMATS.values():
         if format_.pictures is not None and format_.recognizes(path):
             return format_.pictures(path, kind)
     name, remedy = foreign(next(iter(sorted(path.iterdir())), path) if path.is_dir() else path)
-    received = "a folder without any" if path.is_dir() else f"a {path.suffix or 'plain'} file" if path.exists() else "nothing there"
+    received = "a folder without any" if path.is_dir() else f"a {path.suffix or 'plain'} file" if path.exists() else "no such path"
     known = " or ".join(format_.about for format_ in FORMATS.values() if format_.pictures is not None)
     raise InputError(path, known.format(kind=kind, endings=" ".join(ENDINGS[kind])), name or received, remedy)
 
 
 def open_recording(intake: Intake) -> list[CameraStreams] | Capture:
-    """The streams of a recording, or the capture that its format wrote. Raises InputError."""
-    fitting = {key: one for key, one in FORMATS.items() if one.pictures is None}
-    name = intake.format or next((key for key, one in fitting.items() if one.recognizes(intake.recording[0])), "")
-    if name not in fitting:
-        raise InputError("--format", f"must be one of {', '.join(fitting)}", name or f"none that reads {intake.recording[0]}")
-    one = fitting[name]
-    if one.recording is not None:
-        return one.recording(intake)
-    assert one.capture is not None, "a format without pictures opens recordings or writes captures"
-    return one.capture(intake)
+    """Open the streams of a recording, or return the capture that its format wrote. Raises InputError."""
+    formats = {key: format_ for key, format_ in FORMATS.items() if format_.pictures is None}
+    name = intake.format or next((key for key, format_ in formats.items() if format_.recognizes(intake.recording[0])), "")
+    if name not in formats:
+        raise InputError("--format", f"must be one of {', '.join(formats)}", name or f"none that reads {intake.recording[0]}")
+    chosen = formats[name]
+    if chosen.recording is not None:
+        return chosen.recording(intake)
+    assert chosen.capture is not None, "a format without pictures opens recordings or writes captures"
+    return chosen.capture(intake)
 
 
 def open_streams(intake: Intake) -> list[CameraStreams]:
-    """The streams of --color and --depth, one of each per camera. Raises InputError."""
+    """Open the streams of --color and --depth, one of each per camera. Raises InputError."""
     if intake.depth and len(intake.color) != len(intake.depth):
-        rule = "as many folders or videos of depth as of color are required, one each per camera"
+        rule = "one folder or video of color and one of depth are required per camera"
         raise InputError("--color, --depth", rule, f"{len(intake.color)} of color, {len(intake.depth)} of depth")
     colors = [open_images(path, "color") for path in intake.color]
     depths: list[ImageSource | None] = [open_images(path, "depth") for path in intake.depth]
@@ -80,7 +80,7 @@ def open_streams(intake: Intake) -> list[CameraStreams]:
 
 
 def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
-    """The image, if it is RGB of 8 bits, or depth of one channel: 16 bits or more, or floating point. Raises InputError."""
+    """Return 8-bit RGB, or depth with one channel of at least 16 bits or floating point. Raises InputError for other images."""
     received = f"{image.dtype} of shape {image.shape}"
     if kind == "color":
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
@@ -88,6 +88,6 @@ def require_kind(path: Path, kind: Kind, image: np.ndarray) -> np.ndarray:
         return image
     image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     if image.ndim != 2 or image.dtype.kind not in "uif" or image.dtype.itemsize < 2:
-        remedy = "Export the raw depth (16-bit PNG or npy): colors and 8 bits lose it."
+        remedy = "Export raw depth as 16-bit PNG or npy; colored or 8-bit images lose it."
         raise InputError(path, "depth must have one channel [H, W] of at least 16 bits", received, remedy)
     return image

@@ -1,4 +1,4 @@
-"""A folder of images, in the order of the numbers in their names; stamps.csv (file,seconds) in it states when each was taken."""
+"""Folders of images, sorted by the numbers in their names; a file stamps.csv (file,seconds) states their times."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ DIGITS = re.compile(r"([0-9]+)")
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Images in one folder; by stamps, else in the order of their names, in which digits count as numbers: 10 comes after 9."""
+    """Images in one folder, sorted by stamps, else by names, in which digits are numbers: 10 comes after 9."""
 
     path: Path
     kind: Kind
 
     @cached_property
     def stamps(self) -> dict[str, float]:
-        """s by file; empty without stamps.csv. Raises InputError."""
+        """File -> time, s; empty without stamps.csv. Raises InputError."""
         if not (file := self.path / STAMPS).is_file():
             return {}
         import pandas as pd
@@ -41,20 +41,22 @@ class ImageFolder:
 
     @cached_property
     def paths(self) -> list[Path]:
-        """Its images. Raises InputError where there are none, or of two formats."""
+        """The images of the folder. Raises InputError for no images or several formats."""
         found = [path for path in self.path.iterdir() if path.suffix.lower() in ENDINGS[self.kind] and path.name[0] != "."]
         endings = sorted({path.suffix.lower() for path in found})
         if len(endings) != 1:
             rule = f"{self.kind} images of one format are required ({' '.join(ENDINGS[self.kind])})"
-            raise InputError(self.path, rule, " and ".join(endings) or "none", "Color and depth need a folder of their own each.")
+            raise InputError(self.path, rule, " and ".join(endings) or "none", "Use separate folders for color and depth.")
         if self.stamps and (missing := {path.name for path in found} ^ self.stamps.keys()):
-            raise InputError(self.path / STAMPS, "one row for each image is required", f"not of both: {min(missing)}")
+            raise InputError(
+                self.path / STAMPS, "exactly one row for each image is required", f"{min(missing)} in only one of them"
+            )
         parts = {path: [int(part) if part.isdigit() else part for part in DIGITS.split(path.stem)] for path in found}
         return sorted(found, key=lambda path: (self.stamps.get(path.name, 0.0), parts[path]))
 
     @cached_property
     def series(self) -> Series:
-        """Stamps; else frame numbers: the digits in which the names differ."""
+        """Times from stamps; otherwise frame numbers, which are the digits in which the names differ."""
         count = list(range(len(self.paths)))
         if self.stamps:
             return Series(count, np.array([self.stamps[path.name] for path in self.paths]), clock=STAMPS)
@@ -74,12 +76,12 @@ class ImageFolder:
             yield require_kind(path, self.kind, image[..., ::-1] if self.kind == "color" else image)
 
     def files(self, places: Sequence[int]) -> list[Path]:
-        """One per image."""
+        """One file per image."""
         return [self.paths[place] for place in places]
 
 
 def holds_images(path: Path) -> bool:
-    """True for a folder with an image in it; folders of other files are left to other formats."""
+    """True for a folder that contains an image."""
     return path.is_dir() and any(file.suffix.lower() in (*ENDINGS["color"], *ENDINGS["depth"]) for file in path.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""A case in PhysTwin's raw layout, which `neuspring.intake.phystwin_raw` converts."""
+"""Cases in PhysTwin's raw layout, converted by `neuspring.intake.phystwin_raw`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from neuspring.intake.phystwin_raw import convert
 def _capture(intake: Intake) -> Capture:
     given = [f"--{name}" for name in ("rig", "frames", "shift", "topics", "train_end") if getattr(intake, name)]
     if given or len(intake.recording) != 1:
-        remedy = "The case states it all; `neuspring cut-capture` keeps some frames."
+        remedy = "Remove these options, since the case contains their values; use `neuspring cut-capture` to keep some frames."
         raise InputError(
-            "--recording", "one case of PhysTwin's raw layout is required, alone", " ".join(given) or "several", remedy
+            "--recording", "exactly one case, without other options, is required", " ".join(given) or "several cases", remedy
         )
     return convert(intake.called, intake.category, intake.recording[0], intake.output)
 

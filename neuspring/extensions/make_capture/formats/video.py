@@ -1,4 +1,4 @@
-"""A video, of one or several tracks."""
+"""Video files with one or more tracks."""
 
 from __future__ import annotations
 
@@ -22,33 +22,35 @@ if TYPE_CHECKING:
 VIDEO_ENDINGS = (".mkv", ".mp4", ".mov", ".avi", ".m4v", ".webm")
 TONE_MAP = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip,zscale=t=bt709:m=bt709:r=tv,format=yuv420p"
 SQUARE_PIXELS = "scale=WIDTH:HEIGHT,setsar=1"
-"""ffmpeg applies marks by itself; WIDTH and HEIGHT are those of the intrinsics."""
+"""ffmpeg applies rotation marks by itself; WIDTH and HEIGHT are those of the intrinsics."""
 LOSSLESS = ("ffv1", "png", "rawvideo", "tiff", "apng")
 
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A video; depth needs a gray one of 16 bits."""
+    """A video; depth requires 16-bit gray."""
 
     path: Path
     kind: Kind
     track: int | None = None
-    """Which of its video tracks, from 0; None: the only one."""
+    """Index of the video track, from 0; None: the only one."""
 
     @cached_property
     def series(self) -> Series:
-        """Times of the images as they are decoded: a trimmed file contains more than it shows.
+        """Times of the decoded images; a trimmed file contains more images than players show.
 
-        Raises InputError for a file without video, one whose container turns, flips or stretches it, and depth that is not exact.
+        Raises InputError for a file without video, a container that rotates, flips or stretches the video, and lossy depth.
         """
         with self._opened() as (container, stream):
-            codec, tracks = stream.codec_context, len(_films(container))
+            codec, tracks = stream.codec_context, len(_video_tracks(container))
             if self.track is None and tracks > 1:
-                raise InputError(self.path, "one video track must be named", f"{tracks} tracks", f"Like {self.path}#1.")
+                raise InputError(
+                    self.path, "one video track must be chosen", f"{tracks} tracks", f"Append its number: {self.path}#1"
+                )
             if self.kind == "depth" and (codec.pix_fmt not in ("gray16le", "gray16be") or codec.name not in LOSSLESS):
                 rule = f"a depth video must be gray with 16 bits and lossless ({' '.join(LOSSLESS)})"
                 raise InputError(
-                    self.path, rule, f"{codec.pix_fmt}, {codec.name}", "Store gray16le in FFV1 (mkv), or PNG of 16 bits."
+                    self.path, rule, f"{codec.pix_fmt}, {codec.name}", "Store gray16le in FFV1 (mkv), or write 16-bit PNG images."
                 )
             base, stamps = float(stream.time_base or 1), list[float]()
             for frame in container.decode(stream):
@@ -56,7 +58,7 @@ class VideoFile:
                     self._require_plain(frame, stream)
                 stamps.append(np.nan if frame.pts is None else frame.pts * base)
         if not stamps:
-            raise InputError(self.path, "a video must have images", "none")
+            raise InputError(self.path, "a video must contain images", "none")
         times = np.sort(stamps)
         if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
             return Series(list(range(len(times))), named=False)
@@ -67,18 +69,18 @@ class VideoFile:
         ratio, matrix = stream.sample_aspect_ratio, [one for one in frame.side_data if "DISPLAYMATRIX" in str(one)]
         codec = stream.codec_context
         for received, wrong, filters in (
-            ("a mark by which players turn or flip it", matrix, SQUARE_PIXELS),
+            ("a mark that makes players rotate or flip it", matrix, SQUARE_PIXELS),
             (f"pixels of {ratio}", ratio not in (None, 0, 1), SQUARE_PIXELS),
             ("interlaced", frame.interlaced_frame, "bwdif=mode=send_frame"),
             ("HDR (PQ or HLG)", codec.color_trc in (16, 18), TONE_MAP),
             ("colors of BT.2020", codec.color_primaries == 9, "zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"),
         ):
             if wrong:
-                rule = "a video must be upright, of square pixels, whole frames, and 8-bit colors of BT.709 or BT.601"
+                rule = "a video must be upright and progressive, with square pixels and 8-bit colors of BT.709 or BT.601"
                 raise InputError(self.path, rule, received, f"Convert it: ffmpeg -i VIDEO -vf {filters} -crf 12 plain.mp4")
 
     def read(self, places: Sequence[int]) -> Iterator[np.ndarray]:
-        """As a folder. The video is decoded from its beginning. Raises InputError where it ends early."""
+        """See `ImageSource.read`. Decodes the video from its beginning. Raises InputError if it ends early."""
         wanted = list(places)
         with self._opened() as (container, stream):
             for place, frame in enumerate(container.decode(stream)):
@@ -88,7 +90,7 @@ class VideoFile:
                     yield require_kind(self.path, self.kind, image)
                 if not wanted:
                     return
-        raise InputError(self.path, f"an image {wanted[0]} is required", "the file ends before it")
+        raise InputError(self.path, f"image {wanted[0]} is required", "a file that ends before it")
 
     def files(self, places: Sequence[int]) -> list[Path]:
         """The video."""
@@ -96,23 +98,23 @@ class VideoFile:
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-        """The file with its track. Raises InputError for a file that is no video, or is damaged."""
+        """Open the file and its track. Raises InputError for a file that is damaged or not a video."""
         needed("av")
         import av
 
         try:
             with av.open(str(self.path)) as container:
-                films, track = _films(container), self.track or 0
-                if track >= len(films):
-                    raise InputError(self.path, f"a video track is required; the file has {len(films)}, from 0", f"track {track}")
-                films[track].thread_type = "AUTO"
-                yield container, films[track]
+                videos, track = _video_tracks(container), self.track or 0
+                if track >= len(videos):
+                    raise InputError(self.path, f"a video track below {len(videos)} is required", f"track {track}")
+                videos[track].thread_type = "AUTO"
+                yield container, videos[track]
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(self.path, "this file must be a readable video", str(error)) from error
 
 
-def _films(container: av.container.InputContainer) -> list[av.VideoStream]:
-    """Video tracks that are not the picture of a cover."""
+def _video_tracks(container: av.container.InputContainer) -> list[av.VideoStream]:
+    """Video tracks without cover images."""
     import av.stream
 
     return [s for s in container.streams.video if not s.disposition & av.stream.Disposition.attached_pic]
