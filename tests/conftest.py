@@ -1,4 +1,4 @@
-"""Hypothesis draws the same examples in every run, and none has a deadline: what fails on one machine fails on all.
+"""Hypothesis draws the same examples in every run, without a deadline, so that failures are the same on all machines.
 
 To look for new examples: `pytest --hypothesis-profile default`.
 """

@@ -1,4 +1,4 @@
-"""Who imports whom: rooms of the package import downwards only, the workflow starts light, and no test imports another test."""
+"""Imports: packages import lower levels only, the workflow starts with few modules, no test imports another test."""
 
 import ast
 import re
@@ -86,7 +86,7 @@ def test_only_the_tracking_package_imports_mlflow():
 
 
 def test_what_the_workflow_imports_at_its_start_is_light():
-    """What one of them would import, all of them together would have imported."""
+    """A module that one of them imports is also imported by all of them together."""
     code = f"""
 import importlib, sys
 for module in {LIGHT}:
@@ -97,7 +97,7 @@ for module in {LIGHT}:
 
 
 def test_the_twin_and_the_simulator_import_torch_warp_and_numpy_alone():
-    """Of what computes or draws; settings and records need pydantic, PyYAML and filelock, which are small."""
+    """They import no other package that computes or draws; small packages (pydantic, PyYAML, filelock) are allowed."""
     code = f"""
 import importlib, sys
 class Blocked:

@@ -1,4 +1,4 @@
-"""`make install` before pip runs: which Python it takes, and a `.venv` that is of no use."""
+"""`make install` before pip runs: the selected Python, and an unusable `.venv`."""
 
 import os
 import shutil

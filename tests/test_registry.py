@@ -1,4 +1,4 @@
-"""The registry: names without imports, packages that add members, and what is refused."""
+"""The registry: names without imports, packages that add members, errors."""
 
 import importlib.metadata
 from importlib.metadata import EntryPoint

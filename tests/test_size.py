@@ -1,4 +1,4 @@
-"""The size of the package in tokens of code per folder, against `size.toml`, and what keeps it readable."""
+"""The size of the package in tokens of code per folder against `size.toml`, and rules of readability."""
 
 import ast
 import io

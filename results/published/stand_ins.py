@@ -1,8 +1,8 @@
-"""Small stand-ins for the data and the results that commands of this folder read, to try a command without them.
+"""Small substitutes for the data and results that the commands of this folder read, to try a command without them.
 
     python -m results.published.stand_ins beam.make FOLDER       # writes FOLDER and prints commands that read it
 
-Numbers that come of them mean nothing. `play.make` needs a browser, and has none.
+Their numbers are meaningless. `play.make` has no substitute, because it needs a browser.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from tests.support.c3d_files import write_c3d
 
 ROOT = Path(__file__).parents[2]
 SHARES, RELAXED = np.array([0.2, 0.1, 0.05, 0.04]), 6.8
-"""Law of the beam: shares of its branches, and its frequency, Hz."""
+"""Law of the beam: shares of its branches, and its relaxed frequency, Hz."""
 CASE = "single_clift_cloth_1"
-"""A case that has marks."""
+"""A case with annotations."""
 
 
 class StandIn(NamedTuple):
-    """Commands, in their order, without their script; and names in modules with values with which they take seconds."""
+    """Commands in order, without their script, and values of module names that make them take seconds."""
 
     commands: list[list[object]]
     smaller: dict[str, Any] = {}
 
 
 def released(folder: Path, name: str, held: float, noise: float = 1e-5, seed: int = 0) -> Path:
-    """A recording of 500 frames of a tip that is held so high over its rest, m, and let go after 0.7 s; theirs: x up, z along."""
+    """A recording of 500 frames of a tip that is held `held` m above rest and released after 0.7 s (x up, z along)."""
     times = np.arange(500) / 100 - 0.704
     height = held * beam.motion((2 * np.pi * RELAXED) ** 2, SHARES, times)
     section = np.array([[0.07, 0.03, 0.1], [0.06, 0.05, 0.1], [0.04, 0.01, 0.09]])
@@ -71,7 +71,7 @@ def of_beam(folder: Path) -> StandIn:
 
 
 def of_silicones(folder: Path) -> StandIn:
-    """Pictures of a beam at rest, of all three materials and twisted, from before the marker; the surface is a coarse box."""
+    """Images of a beam at rest, of all three materials and twisted, from in front of the marker; the surface is a coarse box."""
     (folder / "cad").mkdir()
     corners = np.array([[x, y, z] for x in (-9.9, 9.9) for y in (-1.4, 1.4) for z in (-1.4, 1.4)])
     lines = [f"v {x} {y} {z}" for x, y, z in corners] + [
@@ -97,13 +97,13 @@ def of_silicones(folder: Path) -> StandIn:
     smaller: dict[str, Any] = {f"two_materials.{module}.minimize": short for module in ("make", "beams")}
     smaller |= {"two_materials.beams.CELLS": 2, "two_materials.make.STEPS": 1, "two_materials.make.VERTICES": 7}
     smaller |= {"two_materials.make.TURN": 10.0, "two_materials.make.RATIOS": (2.5,), "two_materials.make.SIZES": ()}
-    # The second goes on where the first ended.
+    # The second command resumes the first.
     commands = [["hanging", folder, folder / "out", "--rows", "uniform"]]
     return StandIn(commands + [[command, folder, folder / "out"] for command in ("hanging", "tables", "twisted")], smaller)
 
 
 def of_foam(folder: Path) -> StandIn:
-    """A cylinder that hangs at rest, rivals that know it, and a twin that was never fitted."""
+    """A cylinder that hangs at rest, rivals that predict it exactly, and a twin that was not fitted."""
     settings = parse(Config, read_yaml(ROOT / "config/data/foam.yaml"), "foam")
     places = {"p_b": (0.0, 0.0, 2.0), "phi_b": (0.0, 0.0, 0.0), "p_m": (0.897, 0.004, 1.819), "p_e": (1.857, 0.026, 1.626)}
     columns = {
@@ -125,13 +125,13 @@ def of_foam(folder: Path) -> StandIn:
 
 
 def sampled(folder: Path) -> Path:
-    """Results of the scenario that travels with the package."""
+    """Results of the sample scenario of the package."""
     shutil.copytree(sample_twin().parents[2], folder / "results")
     return folder / "results"
 
 
 def synthesized(folder: Path) -> Path:
-    """The same with a capture of noise and a truth that moves as the twin does."""
+    """The same with a capture of noise and a truth that moves like the twin."""
     results, run = sampled(folder), RunFolder.of(sample_twin())
     assert run.trajectory is not None
     nodes, hands = run.trajectory.positions[:, ::20], run.observations.controller_points.mean(axis=1, keepdims=True)
@@ -163,7 +163,7 @@ def synthesized(folder: Path) -> Path:
 
 
 def of_cameras(folder: Path) -> StandIn:
-    """A synthetic scene, and runs that saw three cameras and one."""
+    """A synthetic scene, and runs from three cameras and from one."""
     results, runs = synthesized(folder), folder / "runs"
     scenario = sample_twin().parents[1]
     for arm in ("three", "color"):
@@ -179,7 +179,7 @@ def of_scenes(folder: Path) -> StandIn:
 
 
 def of_hands(folder: Path) -> StandIn:
-    """Thirty points of a hand that rises above a rope, nodes and annotated points of it, in counts; up is -z."""
+    """Thirty points of a hand that rises above a rope, its nodes and annotated points, in counts; up is -z."""
     rng, case = np.random.default_rng(0), folder / "single_lift_rope"
     case.mkdir()
     nodes = np.stack([np.arange(0, 3000, 50), np.zeros(60), np.full(60, -300)], axis=1).astype(int)
@@ -192,7 +192,7 @@ def of_hands(folder: Path) -> StandIn:
 
 
 def filmed(folder: Path) -> Path:
-    """A film of six frames painted by the marks of its case, and rivals that show the same."""
+    """A video of six frames painted from the annotations of its case, and rivals that show the same."""
     data = folder / "phystwin22_films"
     for name in ("observation_30fps", "renders_25fps"):
         (data / name).mkdir(parents=True)
@@ -215,12 +215,12 @@ def filmed(folder: Path) -> Path:
 
 
 def of_films(folder: Path) -> StandIn:
-    """A film of a known case."""
+    """A video of a known case."""
     return StandIn([[filmed(folder), folder / "out"]])
 
 
 def of_renders(folder: Path) -> StandIn:
-    """The same with its capture, and a run without pictures."""
+    """The same with its capture, and a run without images."""
     films.write_captures(filmed(folder), folder / "work" / "captures", [CASE])
     run = folder / "work" / "results" / f"film_{CASE}" / "neuspring_wide" / "0"
     run.mkdir(parents=True)
@@ -229,7 +229,7 @@ def of_renders(folder: Path) -> StandIn:
 
 
 def of_cloth(folder: Path) -> StandIn:
-    """A sheet of 7 x 7 nodes that leans and does not move, and a prediction in which it has no size."""
+    """A sheet of 7 x 7 nodes that leans and does not move, and a prediction of size zero."""
     x, z = np.mgrid[:7, :7][::-1]
     states = np.stack([x, 0.1 * z, z]).reshape(147, 1)
     savemat(folder / "SOMtraj8_1_10ms.mat", {"SOMrec": {"states": np.tile(states, (2, 40))}})
@@ -262,11 +262,11 @@ STAND_INS: dict[str, Callable[[Path], StandIn]] = {
     "synthetic.make": lambda folder: StandIn([[synthesized(folder), folder / "out"]]),
     "two_materials.make": of_silicones,
 }
-"""By script, under results.published."""
+"""Script under results.published -> its substitute."""
 
 
 def main() -> None:
-    """Write a stand-in, print its commands."""
+    """Write a substitute and print its commands."""
     script, folder = sys.argv[1:]
     Path(folder).mkdir(parents=True)
     for command in STAND_INS[script](Path(folder)).commands:

@@ -1,4 +1,4 @@
-"""check-data on capture folders: a good one has no errors or warnings, and every other finding is provoked once."""
+"""check-data on capture folders: a valid capture has no errors or warnings, and every other finding is provoked once."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Trajectories of points: what motion capture does to lost markers, labels and streams, and what is only motion."""
+"""Trajectories of points: lost markers, exchanged labels and faulty streams are told from plain motion."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The table of checks: one list with limits and next steps, the page has it, and no part of the package asks for another kind."""
+"""The table of checks: one list with limits and next steps, equal to the page, with no other kind in the package."""
 
 import re
 from importlib.resources import files

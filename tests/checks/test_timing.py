@@ -1,4 +1,4 @@
-"""Time of two streams by what moves: the shift in closed form, and on films of a desk that were put together wrongly."""
+"""Time shift of two streams by their motion: closed form, and videos of a desk with wrong pairs."""
 
 from types import SimpleNamespace
 
@@ -45,7 +45,7 @@ def camera(index=0):
 
 
 def film(index=0, late=0, still=False):
-    """What a camera of the desk shows, with depth `late` frames later than color."""
+    """Images of a camera of the desk, with depth `late` frames later than color."""
     watched = Watched(FRAMES)
     for frame in range(FRAMES):
         depth = seen(camera(index), 0 if still else STRIDE * (frame - late) + 9)[1]

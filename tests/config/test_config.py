@@ -1,4 +1,4 @@
-"""The configuration is strict: what is wrong is named with its path, nothing is cast, nothing is ignored."""
+"""The configuration is strict: errors name the path of the key, nothing is cast, nothing is ignored."""
 
 import dataclasses
 import functools
@@ -132,7 +132,7 @@ def test_configuration_and_artifacts_agree_on_names(name):
 
 
 def commanded(*entries):
-    """What the workflow reads of `--config`, by Snakemake's own parser."""
+    """Values that the workflow reads from `--config`, by Snakemake's parser."""
     return config.of_command_line(parse_config(entries))
 
 

@@ -1,4 +1,4 @@
-"""Artifacts: what is saved is what is loaded, what is wrong is named, what is interrupted leaves the old file."""
+"""Artifacts: files are read as they were written, errors name the fault, an interrupted write keeps the old file."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Checkpoints and resumable training: what is saved comes back; a damaged or foreign checkpoint is left alone, with a message."""
+"""Checkpoints and resumable training: a damaged or foreign checkpoint is kept, with a message."""
 
 import numpy as np
 import pytest

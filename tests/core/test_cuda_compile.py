@@ -26,9 +26,9 @@ LONG = {"neuspring.physics.frame", "neuspring.extensions.rods.solver"}
 ARCHITECTURES = (80, 90)
 """A100 and H100, as compute capability x 10."""
 CHOICES: dict[str, tuple[Any, ...]] = {"real": (wp.float32, wp.float64), "width": (1,)}
-"""What factories are asked for, by the name of the parameter. On a GPU a thread has one lane (neuspring/physics/arrays.py)."""
+"""Arguments of factories by name of the parameter. On a GPU a thread has one lane (neuspring/physics/arrays.py)."""
 FORWARD = "_cuda_kernel_forward"
-"""What Warp adds to a kernel's mangled name in machine code."""
+"""Suffix that Warp adds to a kernel's mangled name in machine code."""
 
 
 def variants(made: Any) -> list[tuple[Any, ...]]:

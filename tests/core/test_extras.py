@@ -1,4 +1,4 @@
-"""Extras of the installation: what is missing is named, and what is named is there."""
+"""Extras of the installation: errors name the missing extra, and the named extra exists."""
 
 import sys
 import tomllib

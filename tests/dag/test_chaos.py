@@ -1,4 +1,4 @@
-"""A benchmark that is killed, interrupted, started twice, copied and out of disk ends as an undisturbed one."""
+"""A benchmark that is killed, interrupted, started twice, copied or out of disk ends like an undisturbed benchmark."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""The profile for Kubernetes with a stand-in for kubectl, whose pods are processes of this machine; no cluster."""
+"""The profile for Kubernetes with a substitute for kubectl, whose pods are processes of this machine, without a cluster."""
 
 import importlib.util
 import json
@@ -92,7 +92,7 @@ def test_names_alone_are_jobs_to_cancel(tmp_path):
 
 
 def image_copies():
-    """What the image's recipe copies to /source."""
+    """Files that the image's recipe copies to /source."""
     lines = re.findall(r"^COPY (.+) /source\S*$", (ROOT / "workflow" / "envs" / "Dockerfile").read_text(), re.MULTILINE)
     return [name for line in lines for name in line.split()]
 

@@ -1,4 +1,4 @@
-"""Every profile plans the same jobs, wherever they are to run."""
+"""Every profile plans the same jobs."""
 
 import importlib.util
 

@@ -1,4 +1,4 @@
-"""A small run on a real Slurm of one node with two stand-ins for GPUs, with a job cancelled on the way."""
+"""A small run on a real Slurm of one node with two substitutes for GPUs; one job is cancelled."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""The real workflow on tiny configurations: it runs, it explains bad input, it survives being killed."""
+"""The real workflow on tiny configurations: it runs, explains bad input, and resumes after a kill."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The capture folder: what is written is read, and every refusal names the file, the field and the value."""
+"""The capture folder: files are read as they were written, and every error names the file, the field and the value."""
 
 import json
 

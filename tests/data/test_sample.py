@@ -1,4 +1,4 @@
-"""The twin that travels with the package: a run as the workflow leaves it, whole, small, and named by its commit."""
+"""The sample twin of the package: a complete, small run of the workflow that names its commit."""
 
 import re
 

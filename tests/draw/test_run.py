@@ -1,4 +1,4 @@
-"""Pictures exist, hold what they say, and survive what runs can be: equal values, one region, divergence."""
+"""Figures exist, contain what they claim, and allow equal values, one region and divergence."""
 
 from dataclasses import replace
 

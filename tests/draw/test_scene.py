@@ -1,4 +1,4 @@
-"""Cameras from any side hold what they show, turn as they say, and parts of a picture are where the whole has them."""
+"""Cameras from any side contain their scene and rotate by their angle; crops of an image match the complete image."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Videos are read back: pictures, size, rate, colors; what is refused."""
+"""Videos are read back: images, size, frame rate, colors; errors."""
 
 import struct
 from pathlib import Path

@@ -218,7 +218,7 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
     assert found.transfers["DLO7_train_3"] == ("DLO7_eval_1", "DLO7_eval_2")
     assert len(found.transfers["DLO8_train_3"]) == 14
     assert found.applies("one", "DLO8_train_3")
-    with pytest.raises(InputError, match=r"DLO8: at least 4 recordings.*received 3 and 14.*there: DLO7, DLO8"):
+    with pytest.raises(InputError, match=r"DLO8: at least 4 recordings.*received 3 and 14.*found: DLO7, DLO8"):
         made(cables=["DLO8"], clips=4)
     with pytest.raises(InputError, match=r"DLO9: at least 2 recordings.*received 0 and 0"):
         made(cables=["DLO9"], clips=2)
@@ -266,7 +266,7 @@ def test_a_capture_without_what_its_masks_are_made_of_is_named_before_any_job(tm
     with pytest.raises(InputError, match=r"perception\.segment\.backend: must be one of given, opencv, .*received magic"):
         planned("magic")
     (tmp_path / "mine").mkdir()
-    with pytest.raises(InputError, match=r"mine: a capture is a folder with capture\.json.*neuspring make-capture"):
+    with pytest.raises(InputError, match=r"mine: a capture must be a folder with capture\.json.*neuspring make-capture"):
         planned("opencv")
     write(tmp_path / "mine" / "capture.json", json.dumps(config.plain(describe(masks=False))))
     assert planned("opencv").scenarios
@@ -485,7 +485,7 @@ EXTRA_ROWS = {"extra_rows": {path.stem: str(path) for path in EXTRA}}
 
 
 def shipped(data, *studies):
-    """What the workflow reads of config/config.yaml, a file of config/data and files of config/studies."""
+    """Settings that the workflow reads from config/config.yaml, a file of config/data and files of config/studies."""
     values = {}
     for name in ("config", f"data/{data}", *(f"studies/{study}" for study in studies)):
         config.merge(values, config.read_yaml(ROOT / "config" / f"{name}.yaml"))

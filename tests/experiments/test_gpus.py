@@ -1,4 +1,4 @@
-"""Leases: no two jobs on one slot, no slot lost to a crash, none idle while somebody waits."""
+"""Leases: one job per slot, no slot is lost to a crash, no slot is idle while a job waits."""
 
 import contextlib
 import functools

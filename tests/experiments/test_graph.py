@@ -1,4 +1,4 @@
-"""The jobs of a benchmark: what they are made of, which are finished, and why one is made again."""
+"""The jobs of a benchmark: their inputs, which are finished, and why a job runs again."""
 
 import json
 import os

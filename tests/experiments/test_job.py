@@ -1,4 +1,4 @@
-"""One job: it runs its steps in order, skips those whose records agree, and one bad member of a batch stops no other."""
+"""One job: it runs its steps in order, skips steps with matching records, and a failing batch member stops no other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The workflow without make: what an installation brings, where it is found, and the command that runs it."""
+"""The workflow without make: its files in an installation, their location, and the command that runs it."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""What `neuspring doctor` says of a machine: what is there, what is missing, what cannot work as configured."""
+"""`neuspring doctor` reports what is installed, what is missing, and what cannot work as configured."""
 
 from neuspring import config
 from neuspring.cli.main import main
@@ -17,7 +17,7 @@ def test_what_is_not_configured_is_absent_and_no_fault(tmp_path, monkeypatch):
     assert not [finding for finding in found.values() if finding.state == "broken"]
     for subject in ("LPIPS (AlexNet)", "VGG16 (Spring-Gaus' features)", "CoTracker3"):
         assert found[subject].state == "absent" and "curl" in found[subject].remedy
-    assert "Everything that is configured can work here." in doctor.text(list(found.values()))
+    assert "This machine can run the configuration." in doctor.text(list(found.values()))
 
 
 def test_what_is_configured_and_cannot_work_is_broken_with_the_next_move(tmp_path, monkeypatch, capsys):
@@ -29,4 +29,4 @@ def test_what_is_configured_and_cannot_work_is_broken_with_the_next_move(tmp_pat
     settings = f"{{results: {tmp_path}, device: cpu, perception: {{track: {{backend: cotracker3}}}}}}"
     (tmp_path / "chosen.yaml").write_text(settings)
     assert main(["doctor", "--settings", str(tmp_path / "chosen.yaml")]) == 1
-    assert "Cannot work as configured: CoTracker3." in capsys.readouterr().out
+    assert "The configuration needs: CoTracker3." in capsys.readouterr().out

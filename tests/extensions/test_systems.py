@@ -160,7 +160,7 @@ def test_all_that_training_reads_is_in_its_record(seen):
 def test_what_is_missing_is_named(seen):
     with pytest.raises(InputError, match="must be a model with training: gs_dynamics, spring_gaus"):
         train(observations=seen, model="static", settings=settings(), seed=0, device="cpu", output=seen.with_name("train.json"))
-    with pytest.raises(InputError, match="supervision: masks needs --capture"):
+    with pytest.raises(InputError, match="supervision: masks requires --capture"):
         train(
             observations=seen,
             model="spring_gaus",

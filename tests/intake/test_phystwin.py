@@ -1,4 +1,4 @@
-"""The PhysTwin reader: what a conforming case becomes, and that every refusal names the file, the key and the place."""
+"""The PhysTwin reader: observations of a valid case; every error names the file, the key and the position."""
 
 import numpy as np
 import pytest

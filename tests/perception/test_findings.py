@@ -78,7 +78,7 @@ def both_squares(upper=OBJECT):
 
 
 def test_what_moves_at_the_object_and_lies_in_no_mask_is_said(moving):
-    """A corner that is lifted and lost, and a hand that comes in unmarked, look alike: the picture changes where no mask is."""
+    """A lost corner and a hand without annotation have the same finding: the image changes outside the masks."""
     name = "motion outside of the masks"
     for right in (both_squares(), both_squares(HANDS)):
         assert name not in {one.name for one in looked_at(moving, right)}

@@ -1,4 +1,4 @@
-"""The file of marks: what is accepted, what is refused, and that it comes back as it was."""
+"""The file of annotations: valid and invalid content, and reading after writing."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Masks on disk, the command that makes them, and that it does nothing twice."""
+"""Masks on disk, and the command that makes them, which repeats nothing."""
 
 import json
 import shutil

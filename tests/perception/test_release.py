@@ -1,4 +1,4 @@
-"""Hands that let go: seen going away, out of view, or back again."""
+"""Hands that release the object: they move away, leave the view, or return."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ ARRIVES = 8
 
 
 def test_a_hand_that_lets_go_is_not_held_by_another_that_arrives():
-    """Pixels of a hand that nobody follows were given to the one that left, which held on at any distance."""
+    """Pixels of an untracked hand must not extend the grasp of the hand that left."""
     away = leaving(10)
     arriving = np.random.default_rng(1).uniform(-0.02, 0.02, (40, 3)) - [0, 0, 0.07]
     pixels = [np.concatenate([own, arriving][: 1 + (frame >= ARRIVES)]) for frame, own in enumerate(scene(away)[0])]

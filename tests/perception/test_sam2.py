@@ -19,7 +19,7 @@ transformers = pytest.importorskip("transformers", reason="needs the extra perce
 torch = pytest.importorskip("torch")
 
 SIDE = 64
-"""Of the images that the tiny SAM 2 sees."""
+"""Side of the images for the tiny SAM 2, px."""
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "toy", "hand"]
 
 

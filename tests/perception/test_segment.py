@@ -1,4 +1,4 @@
-"""Segmentation without a network on a film whose masks are known, and masks that cannot be right."""
+"""Segmentation without a network on a video with known masks, and implausible masks."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The hull of one camera: depth holes carve, and its back is where the stated prior puts it."""
+"""The hull of one camera: depth holes carve it, and the stated prior defines its back."""
 
 from dataclasses import replace
 

@@ -51,7 +51,7 @@ def test_free_fall_is_the_discrete_closed_form(engine, drag, up):
 
 
 def test_masses_conserve_momentum_and_the_oscillation_has_the_reduced_mass(engine):
-    """Of two nodes of 0.5 and 2 kg on a spring: q'' = -(Y / l0) (1/m_1 + 1/m_2) q, and m_1 v_1 + m_2 v_2 stays."""
+    """Equation of two nodes of 0.5 and 2 kg on a spring: q'' = -(Y / l0) (1/m_1 + 1/m_2) q, and m_1 v_1 + m_2 v_2 stays."""
     mass, dt, steps = np.array([0.5, 2.0]), 1e-3, 200
     body = scene(2, [(0, 1)], [0.2], stiffness=50.0, mass=mass, frame_time=dt)
     x, v = engine(body, np.array([[0.0, 0, 0], [0.22, 0, 0]]), np.array([[0.3, 0.1, 0], [0.3, 0.1, 0]]), no_hands(steps))
@@ -76,7 +76,7 @@ def test_nodes_of_other_mass_collide_with_their_momentum(engine):
 
 LENGTH, STIFFNESS, AMPLITUDE = 0.2, 50.0, 0.02
 OMEGA_SQUARED = 2 * STIFFNESS / LENGTH
-"""Of the distance between two unit masses: q'' = -2 (Y / l0) q."""
+"""Equation of the distance between two unit masses: q'' = -2 (Y / l0) q."""
 PERIOD = 2 * np.pi / np.sqrt(OMEGA_SQUARED)
 
 

@@ -24,7 +24,7 @@ DISTANCE = 0.02
 def clump(crowded: int, pairs: int) -> np.ndarray:
     """`crowded` nodes all within DISTANCE of each other, and `pairs` far pairs of near nodes, shuffled.
 
-    A lonely node follows each of them: its empty list lies right behind theirs, where an overrun would show.
+    A single node follows each of them: its empty list is next in memory, where an overrun would appear.
     """
     rng = np.random.default_rng(1)
     near = rng.uniform(-0.004, 0.004, (crowded, 3))

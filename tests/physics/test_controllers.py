@@ -1,4 +1,4 @@
-"""Controllers that hold in a part of the frames, or take hold later: closed forms, the reference, gradients, all ways to run."""
+"""Controllers that hold in some frames or grasp later: closed forms, the reference, gradients, all kernels."""
 
 from __future__ import annotations
 

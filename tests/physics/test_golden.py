@@ -26,7 +26,7 @@ FRAME_LOSS = 1e-4
 CLIP_LOSS = 1e-3
 """Relative, of the total along the free rollout: the loss is quadratic in residuals of 0.01..0.1 m that carry up to 2e-5 m."""
 COSINE = 0.9999
-"""Of the gradient with respect to log stiffness, per frame."""
+"""Least cosine of the gradients by log stiffness, per frame."""
 NORM = 1e-3
 """Relative, of the norm of that gradient (the README's central differences agree to this)."""
 CONTACT_GRADIENT = 0.01

@@ -1,4 +1,4 @@
-"""Twins simulated together: each gets, bit for bit, what it gets alone, whatever its company, and however a frame is computed."""
+"""Twins simulated together: results equal those of each twin alone, bit for bit, for any batch and kernel."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROUNDING = 1e-5
 """Float32 sums of the same terms in another order, relative to the largest entry: each term is rounded to 6e-8,
 then carried through tens of substeps."""
 SUBSTEPS = (10, 13, 11, 15, 10, 12, 7)
-"""Of the first twins; then again."""
+"""Substeps of the first twins; further twins repeat them."""
 SIZES = [(SINGLE, 7), (SINGLE, 17), (DOUBLE, 6)]
 """Less than, and more than the eight lanes."""
 
@@ -184,7 +184,7 @@ def test_a_broken_twin_breaks_no_other(how, broken):
 
 @pytest.mark.parametrize(("name", "value"), [("gravity", 1.6), ("self_collision", True), ("collision_capacity", 7)])
 def test_twins_share_their_physics(name, value):
-    """What the solver takes from the first would be wrong for the others."""
+    """The solver reads these values from the first twin, so they must be equal."""
     body, *_ = member(0, "ground")
     with pytest.raises(InputError, match=rf"simulation\.{name}.*same for all twins"):
         solver_for([body, replace(body, simulation=replace(body.simulation, **{name: value}))], 2)

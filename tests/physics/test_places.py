@@ -1,4 +1,4 @@
-"""Which files know a force's parameter by name: what has to be touched to add another one."""
+"""The files that name a force's parameter; another parameter requires changes in these files."""
 
 import ast
 from pathlib import Path
@@ -17,7 +17,7 @@ PLACES = {
     "twin/parameters.py": "how it is trained",
     "twin/bodies/lattice.py": "the equation in words",
 }
-"""Of drag, with `decay`, what the kernels take of it: files of the package that a force with one trained parameter needs."""
+"""Files that name drag or `decay`, its form in the kernels: a force with one trained parameter requires these files."""
 VALUES = {
     "scenes/toy.py": "the drag of the toy's truth",
     "twin/search.py": "the released rounding of drag",

@@ -1,4 +1,4 @@
-"""The stability bound: sharp for one oscillator, valid for nets, and reported with node, bound and remedy."""
+"""The stability bound: sharp for one oscillator, valid for lattices, reported with node, bound and next step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.scenes import Scene, random_scene, scene, twin_of, warp
 MARGIN = 0.01
 """Relative distance of dt from the bound on either side."""
 GROWTH = 100.0
-"""What separates bounded from diverging after 400 substeps. 1 % beyond the bound amplifies by exp(0.28) each without dashpot
+"""Threshold between bounded and diverging after 400 substeps. 1 % beyond the bound amplifies by exp(0.28) each without dashpot
 and by 1.02 with dashpot alone; 1 % below it a bounded motion swells by up to 1 / sin(theta) = 5 at first."""
 LANCZOS = 2e-3
 """Relative, of an eigenvalue from `eigsh` with tol=1e-3, which approaches it from below."""

@@ -1,4 +1,4 @@
-"""The report says what is on disk, whatever state that is in, and needs nothing else to be read."""
+"""The report shows what is on disk, in any state, and is self-contained."""
 
 import re
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What a results folder has to show, and what of a damaged or hostile one is refused."""
+"""The viewable content of a results folder, and errors for damaged or hostile folders."""
 
 import io
 import zipfile

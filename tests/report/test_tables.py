@@ -1,4 +1,4 @@
-"""Tables say who is ahead and whether that is resolved, compare like with like, and hide no gap."""
+"""Tables show which method is better and whether this is resolved, compare equal sets, and show gaps."""
 
 import json
 from dataclasses import replace
@@ -223,7 +223,7 @@ def test_paired_differences_weigh_scenarios_equally_on_the_same_seeds():
 
 
 def test_the_bootstrap_has_the_variance_of_both_levels():
-    """Twelve scenarios alike but for independent noise of three seeds."""
+    """Twelve equal scenarios with independent noise of three seeds."""
     rng = np.random.default_rng(1)
     runs = [rng.normal(size=3) for _ in range(12)]
     within = np.mean([part.var() / 3 for part in runs]) / 12

@@ -1,4 +1,4 @@
-"""The silicone beam: its law from a ring-down whose law is known, its twins against closed forms, and the real recordings."""
+"""The silicone beam: its law from a ring-down with a known law, and its twins against closed forms."""
 
 import numpy as np
 import pytest

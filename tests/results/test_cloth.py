@@ -1,4 +1,4 @@
-"""The leaning sheet of a recording is made plumb, and a sheet's error counts its free nodes."""
+"""A leaning sheet is rotated to hang straight, and the error of a sheet counts its free nodes."""
 
 import numpy as np
 import pytest

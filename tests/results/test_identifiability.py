@@ -1,4 +1,4 @@
-"""results/published/identifiability/make.py measures what it says, and repeats no finished run."""
+"""The metrics of results/published/identifiability/make.py; finished runs are not repeated."""
 
 import functools
 

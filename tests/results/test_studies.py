@@ -1,4 +1,4 @@
-"""The pure parts of studies: silhouettes of rivals, their shifts, IoU without hands, and what is studied."""
+"""Published studies: silhouettes of rivals, their shifts, IoU without hands, the selected scenes and methods."""
 
 import importlib
 import sys

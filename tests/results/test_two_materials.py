@@ -1,4 +1,4 @@
-"""The two-material study: equilibrium is the simulator's, derivatives are those of differences, a twisted beam turns evenly."""
+"""The two-material study: equilibrium as in the simulator, derivatives as in finite differences, an even twist."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Toy scenes: truth known and kept apart, observation imperfect as asked, everything deterministic."""
+"""Toy scenes: truth is kept apart, observations have the requested noise, everything is deterministic."""
 
 import numpy as np
 import pytest

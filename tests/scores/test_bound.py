@@ -1,4 +1,4 @@
-"""Points bound to nodes: exact under rigid motions, whatever the nodes; stable where nodes leave a turn open."""
+"""Points bound to nodes: exact under rigid motions for any nodes; stable where nodes do not determine a rotation."""
 
 from __future__ import annotations
 

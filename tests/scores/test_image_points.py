@@ -1,4 +1,4 @@
-"""Points marked in images: exact under shifts parallel to the image, carried by what is seen, silent about what is not marked."""
+"""Annotated points in images: exact under shifts parallel to the image, bound to visible nodes, no value without annotation."""
 
 from __future__ import annotations
 

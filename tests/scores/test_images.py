@@ -114,7 +114,7 @@ def test_masks_weigh_by_their_value():
 
 @pytest.mark.parametrize("box", [(10, 20, 12, 30), (0, 6, 0, 9), (30, 40, 40, 48), (0, 40, 0, 48)])
 def test_ssim_of_pictures_on_black_is_that_of_the_whole(box):
-    """Of what a scored pair is: an object on black, also at the border."""
+    """Scored pairs: an object on black, also at the border."""
     top, bottom, left, right = box
     a, b = torch.zeros(3, 40, 48), torch.zeros(3, 40, 48)
     generator = torch.Generator().manual_seed(0)

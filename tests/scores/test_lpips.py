@@ -1,4 +1,4 @@
-"""LPIPS with random weights: its definition written out slowly, its ranges, and every way in which weights can be absent."""
+"""LPIPS with random weights: a slow definition, its ranges, and every kind of missing weights."""
 
 import importlib.util
 import shutil

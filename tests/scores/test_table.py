@@ -1,4 +1,4 @@
-"""The long table: what is read of runs, which scores are compared, averages without and with failures."""
+"""The long table: values read from runs, compared scores, averages without and with failures."""
 
 import json
 import math

@@ -52,7 +52,7 @@ def known_splats(count=200):
 
 
 def shot_of(splats, view, name="0", hands=None):
-    """What a camera sees of splats; the mask is where they cover half."""
+    """Image of splats; the mask is where they cover more than half."""
     with torch.no_grad():
         rendered = Gaussians.of(splats).draw(view)
     mask = (rendered.alpha > 0.5).numpy()

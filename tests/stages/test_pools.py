@@ -1,4 +1,4 @@
-"""Search and fit on several recordings, through their stages: what their records name, and that fits share nothing wrong."""
+"""Search and fit on several recordings, through their stages: content of records, and no wrong sharing between fits."""
 
 import numpy as np
 import pandas as pd

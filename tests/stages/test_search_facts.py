@@ -1,4 +1,4 @@
-"""What the record of a search says beside its values."""
+"""Additional facts in the record of a search."""
 
 import pandas as pd
 

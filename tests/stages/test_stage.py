@@ -1,4 +1,4 @@
-"""What follows from the signature of a stage: its command, its record, the passing on of failures, its place in the workflow."""
+"""The signature of a stage defines its command, its record, the propagation of failures and its position in the workflow."""
 
 from __future__ import annotations
 

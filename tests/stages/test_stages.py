@@ -1,4 +1,4 @@
-"""Stages by hand: records name their files, failures pass through, the run record is complete."""
+"""Stages without the workflow: records name their files, failures propagate, the run record is complete."""
 
 import json
 from dataclasses import replace

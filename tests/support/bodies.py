@@ -1,4 +1,4 @@
-"""What every kind of body must answer, whoever brings it."""
+"""Tests of the interface of a body, also for bodies of packages."""
 
 from dataclasses import fields
 

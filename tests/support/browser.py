@@ -111,7 +111,7 @@ class Browser:
         return message
 
     def online(self, yes):
-        """Give pages the network, or take it."""
+        """Enable or disable the network for pages."""
         limits = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         self.call("Network.emulateNetworkConditions", offline=not yes, **limits)
 
@@ -165,7 +165,7 @@ class Browser:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **(text if kind == "keyDown" else {}))
 
     def check(self):
-        """What is wrong with the page: `CHECK`, once all pictures are decoded, with what it logged as `errors`."""
+        """Faults of the page: `CHECK` after all images are decoded, and its log as `errors`."""
         self.run("document.querySelectorAll('details').forEach((fold) => (fold.open = true))")
         self.run("document.querySelectorAll('img').forEach((one) => (one.loading = 'eager'))")
         self.run("Promise.allSettled([...document.images].map((one) => one.decode()))")

@@ -76,7 +76,7 @@ POSED = {"poses": "camera_to_world", "axes": "opencv", "up": "+z"}
 
 
 def write_rig(path, count=1, motion=None, **changes):
-    """What a user states about the cameras, in a world that `motion` [4, 4] moved; keys that are changed to None are left out."""
+    """User's statement of the cameras, in a world moved by `motion` [4, 4]; keys that are changed to None are left out."""
     poses = [(np.eye(4) if motion is None else motion) @ camera(index).camera_to_world for index in range(count)]
     rig = {"frame_rate": 30, "depth_unit": 0.001, **POSED, "cameras": [LENS | {"pose": pose.tolist()} for pose in poses]} | changes
     return write_json(path, {key: value for key, value in rig.items() if value is not None})

@@ -1,4 +1,4 @@
-"""What a check of data found, for assertions."""
+"""Findings of data checks, for assertions."""
 
 from pathlib import Path
 

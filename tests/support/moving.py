@@ -10,7 +10,7 @@ FRAMES, SIZE = 12, (128, 96)
 SHIFT = np.array([2.5, -1.25])
 """Pixels per frame."""
 CORNER = np.array([30.0, 45.0])
-"""Of the square in frame 0."""
+"""Corner of the square in frame 0, px."""
 SIDE = 36
 NEAR, FAR = 0.6, 0.8
 """Depth of the square and of the wall, m."""

@@ -21,7 +21,7 @@ SETTINGS = Config(
 
 
 def perceived(capture, folder, row=ROW, settings=SETTINGS):
-    """What perception finds in a capture; its records and files are in the folder."""
+    """Results of perception for a capture; records and files are in the folder."""
     masks, tracks = [], []
     own = {"capture": capture.folder / "capture.json", "settings": settings}
     for camera in capture.cameras:

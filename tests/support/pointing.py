@@ -38,7 +38,7 @@ def settled(server, browser):
 
 
 def pixel(camera, point):
-    """Where a point [3] is in the window, whose left part is the scene."""
+    """Position of a point [3] in the window; the scene is its left part."""
     local = Rotation.from_quat(camera.wxyz, scalar_first=True).inv().apply(point - camera.position)
     wide, high = camera.image_width, camera.image_height
     focal = high / 2 / np.tan(camera.fov / 2)
@@ -54,7 +54,7 @@ def colored(browser, path):
 
 
 def until_drawn(browser, x, y, path):
-    """Wait until something with a color is drawn at a place of the window: a browser draws later than it is told."""
+    """Wait until a colored pixel is drawn at a position of the window, because browsers draw with a delay."""
     rows, columns = (slice(round(value) - 1, round(value) + 2) for value in (y, x))
     until(lambda: colored(browser, path)[rows, columns].any())
 

@@ -74,7 +74,7 @@ def start(command, project, **variables):
 
 
 def output_of(process, fails=False):
-    """What a run says until its end. Asserts that it succeeds, or that it fails if `fails`."""
+    """Output of a run until its end. Asserts that it succeeds, or that it fails if `fails`."""
     try:
         output, _ = process.communicate(timeout=PATIENCE)
     finally:

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 FOLDER = Path(os.environ.get("NEUSPRING_TEST_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
-"""Where they are looked for: beside the repository, or where the environment says."""
+"""Search path of these recordings: next to the repository, or from the environment."""
 FOOTAGE = FOLDER / "phystwin_camera0"
 """Real color film of one camera, 848 x 480, 30 Hz: videos, masks and points of four frames drawn by hand."""
 FILMS = FOLDER / "phystwin22_films"

@@ -1,4 +1,4 @@
-"""Records of runs that never ran."""
+"""Records of runs that were not executed."""
 
 from neuspring.core.run_record import RunRecord
 

@@ -1,4 +1,4 @@
-"""Small hand-made Observations for tests that need the noun, not a scene."""
+"""Small Observations, made by hand, for tests without a scene."""
 
 import numpy as np
 

@@ -27,7 +27,7 @@ WAYS = [
 ]
 """(device, threads): the CPU also runs the kernels of a GPU, so that every machine tests them."""
 MASSES = np.array([0.3, 1.7, 0.8, 2.1, 0.5, 0.6])
-"""Of the six nodes of lively scenes, kg."""
+"""Masses of the six nodes of lively scenes, kg."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "free": {"on_ground": False},
     "ground": {},
@@ -38,7 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Options of `random_scene` that together reach every term."""
 SCALARS = ("drag", "ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction", "contact_distance")
-"""Of the arguments of `Material`, those that have no default."""
+"""Arguments of `Material` without a default."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Searches of several budgets, and what is equal between two of them."""
+"""Searches of several budgets, and the comparison of two searches."""
 
 from dataclasses import replace
 

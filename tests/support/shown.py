@@ -59,7 +59,7 @@ def filmed(folder, missing=()):
 
 
 def painter(scenario, frames, **manner):
-    """What paints a scenario: from the camera of its video where it has one."""
+    """Painter of a scenario, from the camera of its video if it has one."""
     seen, shown = observed(scenario), takes(scenario)
     if (scenario / "capture").is_dir():
         capture = Capture.load(scenario / "capture")

@@ -67,7 +67,7 @@ def _check():
 
 @contextmanager
 def _own_settings() -> Iterator[None]:
-    """Claim the files in /etc/slurm, unless somebody else's are there; removed at the end."""
+    """Claim the files in /etc/slurm unless they belong to another Slurm; removed at the end."""
     paths = [SETTINGS / name for name in ("slurm.conf", "gres.conf")]
     for path in paths:
         if path.exists() and not path.read_text().startswith(MARK):
@@ -167,7 +167,7 @@ def _output(*command: str) -> str:
 
 
 def _cancel_all():
-    """What a failed test left running, so that no job outlives its node."""
+    """Jobs that a failed test left running, so that no job outlives its node."""
     subprocess.run(["scancel", "--user=root"], check=False, timeout=30)
     deadline = time.monotonic() + PATIENCE
     while _output("squeue", "--noheader") and time.monotonic() < deadline:

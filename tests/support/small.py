@@ -93,7 +93,7 @@ def search_problem(seen: Observations | None = None, **changes: object) -> Searc
 
 
 def judge(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
-    """What becomes of candidates that are rolled out together over the training frames."""
+    """Results of candidates that are rolled out together over the training frames."""
     own = problem.recordings[0]
     return rolled([Rollouts(twins, own.hands, own.velocity, loss)], problem.device)[0]
 

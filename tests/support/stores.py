@@ -1,4 +1,4 @@
-"""What tests of tracking share: small run records, and the results folder's own index."""
+"""Shared by tests of tracking: small run records, and the index of the results folder."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Results of runs without the runs: records, scores and stand-ins for the files that stages leave."""
+"""Results without runs: records, scores and substitutes for the files of stages."""
 
 from collections.abc import Mapping
 from dataclasses import replace

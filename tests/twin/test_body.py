@@ -1,4 +1,4 @@
-"""The body of a twin is asked, never told apart: the lattice, and what a package brings."""
+"""The interface of bodies: the lattice, and a body of a package; no code checks for a kind of body."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What twins, searches, fits and topologies refuse: the exception and the field that it names."""
+"""Errors of twins, searches, fits and topologies: the exception and the field that it names."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A fit does not depend on the unit of length, and the released one is still there."""
+"""A fit does not depend on the unit of length; the released unit can be selected."""
 
 from dataclasses import replace
 

@@ -1,7 +1,7 @@
-"""A search and a fit on a GPU against the CPU, both in float32: the same source with sums in another order.
+"""A search and a fit on a GPU against the CPU, both in float32, with sums in another order.
 
-Both are chaotic: a rope that meets the ground turns a change of 1e-6 into one of 1 % in a candidate's cost. The tolerances leave
-room for what happens on the CPU where the state of every frame is moved by 1e-6 of itself.
+Both are chaotic: ground contact turns a change of 1e-6 into 1 % of a candidate's cost. The tolerances cover the changes on the CPU
+if the state of every frame changes by 1e-6, relative.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Grips that begin later, in all that learns a twin: searches, fits, corrected states; the future is not read."""
+"""Grasps that begin later, in searches, fits and corrected states; the future is not read."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What observed points say about all nodes."""
+"""Motion of all nodes from observed points."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ ROUNDING = 1e-4
 
 
 def moving(acceleration, velocity, frames=8):
-    """The small scene with every point and hand thrown alike."""
+    """The small scene with the same throw for every point and controller."""
     seen = small.observations()
     time = (np.arange(frames) / seen.scenario.frame_rate)[:, None, None]
     path = np.asarray(velocity) * time + np.asarray(acceleration) * time**2 / 2

@@ -1,4 +1,4 @@
-"""What is trained becomes physics: gradients through field and simulator, bounds, clamps, warm start, numbers beside the field."""
+"""Trained parameters become physics: gradients through field and simulator, bounds, clamps, warm start."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Searches and fits of several scenes that share launches: the numbers of each are those that it has alone, bit for bit."""
+"""Searches and fits of several scenes that share launches: results equal those of each scene alone, bit for bit."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_adjoints_are_limited_for_each_fit_that_shares_launches(factor, monkeypa
 
 
 def test_fits_in_step_share_their_launches(monkeypatch):
-    """Three alike make as many frames as one, and each keeps what it computed: no frame is simulated again."""
+    """Three equal scenes simulate as many frames as one; no frame is simulated twice."""
     frames: list[int] = []
     original = FrameSolver.forward
     monkeypatch.setattr(FrameSolver, "forward", lambda self, *a: frames.append(len(a[0])) or original(self, *a))

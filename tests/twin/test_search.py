@@ -115,7 +115,7 @@ def test_lengths_are_multiples_of_the_spacing_of_the_nodes():
 
 
 def test_small_and_large_units_have_the_same_variables_and_springs():
-    """What is measured in spacings grows with the body: 1024 times, a power of two, so that no distance is rounded."""
+    """Values in spacings scale with the object: by 1024, a power of two, so that no distance is rounded."""
     seen = small.observations()
     lengths = ("object_points", "controller_points", "surface_points", "interior_points", "tracks")
     large = replace(seen, **{name: 1024 * getattr(seen, name) for name in lengths})

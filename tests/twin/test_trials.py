@@ -1,4 +1,4 @@
-"""Candidates that are simulated together: each as if it were alone, and judged by the torch losses."""
+"""Candidates that are simulated together: results as alone, with costs equal to the torch losses."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def hands_of(problem: SearchProblem) -> torch.Tensor:
 
 
 def alone(problem: SearchProblem, twins: Sequence[Twin], loss: FrameLoss) -> list[Outcome]:
-    """What becomes of each candidate in a launch of its own."""
+    """Result of each candidate in its own launch."""
     return [small.judge(problem, [twin], loss)[0] for twin in twins]
 
 

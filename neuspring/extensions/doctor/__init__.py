@@ -1,1 +1,1 @@
-"""`neuspring doctor`: what this machine can do, and what is missing."""
+"""`neuspring doctor`: checks of this machine."""

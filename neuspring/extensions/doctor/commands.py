@@ -1,4 +1,4 @@
-"""The command doctor."""
+"""The command `doctor`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from neuspring.cli.options import Settings, read_settings
 
 
 def doctor(settings: Settings = "{}") -> int:
-    """Say what this machine can do, and what is missing; 1 where something that is configured cannot work."""
+    """Check this machine and list missing items; exit status 1 if the configuration needs one of them."""
     from neuspring.extensions.doctor.machine import examine, text
 
     findings = examine(read_settings(settings))

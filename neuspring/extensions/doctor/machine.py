@@ -1,6 +1,6 @@
-"""The machine: interpreter, libraries, devices, weights; and the next move where one is missing.
+"""Checks of the machine: interpreter, libraries, devices and weights, with the next move for each missing item.
 
-broken: the configuration needs it and it is missing. absent: it is missing and not needed.
+A missing item is `broken` if the configuration needs it, else `absent`.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ class MachineCheck:
     state: State
     detail: str
     remedy: str = ""
-    """The next move, where something is absent or broken."""
+    """The next move for an absent or broken item."""
 
 
 def examine(settings: Config) -> list[MachineCheck]:
-    """All checks, for what a configuration asks for."""
+    """Run all checks for a configuration."""
     return [*_libraries(settings), *_devices(settings), *_weights(settings)]
 
 
 def text(checks: list[MachineCheck]) -> str:
-    """The report: a line each, its next move below it, and the verdict."""
+    """The report: one line per check, its next move below it, and the verdict."""
     signs = {"ok": "ok     ", "absent": "absent ", "broken": "BROKEN "}
     width = max(len(check.subject) for check in checks)
     lines = []
@@ -55,7 +55,7 @@ def text(checks: list[MachineCheck]) -> str:
         if check.remedy and check.state != "ok":
             lines.append(f"{' ' * (len(signs['ok']) + width + 2)}-> {check.remedy}")
     broken = [check.subject for check in checks if check.state == "broken"]
-    verdict = f"Cannot work as configured: {', '.join(broken)}." if broken else "Everything that is configured can work here."
+    verdict = f"The configuration needs: {', '.join(broken)}." if broken else "This machine can run the configuration."
     return "\n".join([*lines, "", verdict])
 
 
@@ -85,7 +85,7 @@ def _devices(settings: Config) -> Iterator[MachineCheck]:
         device = resolve_device(settings.device)
         rasterizer = choose_backend(settings.images.backend, device)
     except InputError as error:
-        yield MachineCheck("device", "broken", str(error), "Set device: cpu, or install what the message names.")
+        yield MachineCheck("device", "broken", str(error), "Set device: cpu, or install the missing library.")
         return
     yield MachineCheck("device", "ok", f"{device}; rasterizer {rasterizer}")
 
@@ -94,13 +94,13 @@ def _weights(settings: Config) -> Iterator[MachineCheck]:
     from huggingface_hub import try_to_load_from_cache
 
     hub, segment, track = hub_folder(), settings.perception.segment, settings.perception.track
-    # Files that are known by their checksum. Without them the metric or the term of a loss is left out, and tables say so.
+    # Without these files the metric or loss term is omitted, and tables say so.
     lpips_remedy = f"{DOWNLOAD} {hub / lpips.BACKBONE} {lpips.BACKBONE_ADDRESS}; .venv/bin/pip install --no-deps lpips"
     checked: list[tuple[str, Path | str | tuple[Path, ...], str]] = [("LPIPS (AlexNet)", lpips.find_weights(), lpips_remedy)]
     for weights in filter(None, (baseline.weights for baseline in BASELINES.values())):
         checked.append((weights.what, weights.find(), f"{DOWNLOAD} {hub / weights.file} {weights.address}"))
-    for subject, found, remedy in checked:
-        yield _check(subject, not isinstance(found, str), False, found if isinstance(found, str) else "checksum is right", remedy)
+    for subject, files, remedy in checked:
+        yield _check(subject, not isinstance(files, str), False, files if isinstance(files, str) else "correct checksum", remedy)
     for subject, name in {"GroundingDINO": segment_sam2.DETECTOR, "SAM 2": segment_sam2.VIDEO_MODEL}.items():
         present = isinstance(try_to_load_from_cache(name, "config.json"), str)
         needed = segment.backend == "grounded_sam2" and not segment.grounded_sam2.download

@@ -1,5 +1,5 @@
-"""GS-Dynamics: a graph network predicts where particles go when the hands move a centimeter further.
+"""GS-Dynamics: a graph network predicts the motion of particles for each centimeter of hand motion.
 
-model: presets, graph, network, what is saved, and the rollout. train: what training sees of a capture, batches, losses, epochs.
-What differs from the public code, and what was measured: `README.md` here and in `neuspring/baselines`.
+`model` has presets, graph, network, the saved model and the rollout. `train` has the training data, batches, losses and epochs.
+`README.md` lists the differences from the public code; the results are in `README.md` of `neuspring/baselines`.
 """

@@ -1,4 +1,4 @@
-"""GS-Dynamics as a baseline: what the workflow asks before any job exists, so that nothing heavy is imported."""
+"""GS-Dynamics as a baseline. The workflow imports this module before any job exists, so it imports nothing heavy."""
 
 from neuspring.baselines import Baseline
 

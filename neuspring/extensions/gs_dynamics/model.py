@@ -1,16 +1,16 @@
-"""The model of GS-Dynamics: presets per kind of object, how points become a graph, the network, what is saved, and the rollout.
+"""The model of GS-Dynamics: presets per kind of object, the graph, the network, the saved model and the rollout.
 
-With receiver r and sender s of edge e, h the state of a node, c codes, R = ReLU:
+With receiver r and sender s of edge e, node states h, codes c and R = ReLU, all rounds share the weights and start from h = c_n:
 
-    m_e = R(W_r [c_e, h_r, h_s]),    h' = R(W_p [c_n, sum_e m_e] + h),
+    m_e = R(W_r [c_e, h_r, h_s]),    h' = R(W_p [c_n, sum_e m_e] + h).
 
-a number of rounds with the same weights, from h = c_n. A head turns h of particles into displacements, m. Each block of W_r is
-multiplied with nodes, and the products are gathered at edges: the same sums as products of gathered states, in fewer operations.
+A head maps the states of particles to displacements, m. Each block of W_r multiplies node states, and edges gather the products;
+this gives the same sums as products of gathered states, with fewer operations.
 
-In an open-loop rollout structure points make a step whenever the tools have moved by one.
-In a step, each particle b has the rotation R_b that best maps the offsets to its neighbors in the graph (Kabsch). Where these lie
-on a line, it is the smallest rotation; where there are none, there is none. A point at x follows the particles b, which move by
-u_b, with weights w_b ~ 1 / max(|x - b|, 0.1 mm):
+The rollout is open-loop. Structure points make a step whenever the tools have moved by one step.
+Each particle b has the rotation R_b that best maps the offsets to its neighbors in the graph (Kabsch). For neighbors on a line it
+is the smallest rotation, without neighbors the identity. A point at x follows particles at b, which move by u_b, with weights
+w_b ~ 1 / max(|x - b|, 0.1 mm):
 
     x' = x + sum_b w_b [(R_b - 1) (x - b) + u_b].
 """
@@ -37,11 +37,11 @@ from neuspring.splats.skinning import turn_nodes
 from neuspring.twin.rollout import left_scene
 
 HISTORY = 3
-"""Steps H that the network sees, the present one included."""
+"""Number H of steps in the network's input, including the current step."""
 MESSAGE_ROUNDS = 3
 """Rounds of message passing, which share their weights."""
 UP_AXIS = 2
-"""Positions here have +z up."""
+"""Index of the up axis: +z is up in this module."""
 PresetName = Literal["rope", "animals", "cloth"]
 PRESET_COLUMNS = ("radius", "neighbors", "particles", "noise", "length_weight", "batch", "heights")
 PRESETS: dict[PresetName, tuple[Any, ...]] = {
@@ -52,43 +52,42 @@ PRESETS: dict[PresetName, tuple[Any, ...]] = {
 """The public configurations. Meanings as in `GsDynamicsTraining`."""
 CLOTHS = ("cloth", "package")
 COVERAGE = 0.03
-"""m: no more particles are added once every point lies within it of a particle."""
+"""Distance within which every point has a particle; no more particles are added then, m."""
 MIN_PARTICLE_DISTANCE = 1e-4
-"""Distances are floored here before a weight is computed from them, m."""
+"""Minimum distance in weights, m."""
 HALF_TURN = np.array([1, -1, -1], dtype=np.float32)
-"""Half a turn about the x axis: from a world with -z up to one with +z up, and back. It makes no mirror image."""
-# Without weights: they are drawn by `initial` or set by `of`.
+"""A half turn about the x axis, which maps -z up to +z up and back without mirroring."""
+# Layers start without weights: `initial` draws them, `of` sets them.
 Linear = partial(skip_init, torch.nn.Linear)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamicsTraining(GsDynamics):
-    """The settings with what the public code fixes; what is None has the value of a public configuration, by the category."""
+    """The settings and the constants of the public code. None stands for the value of the preset of the object's category."""
 
     radius: float | None = None
-    """Distance below which nodes feel each other, m."""
+    """Maximum length of an edge, m."""
     neighbors: int | None = None
-    """Number k of nearest particles that a particle feels, itself included."""
+    """Number k of nearest particles from which a particle receives messages, including itself."""
     particles: int | None = None
-    """Largest number of particles of a graph."""
+    """Maximum number of particles of a graph."""
     noise: float | None = None
     """Half width of the uniform noise that training adds to positions in the history, m."""
     length_weight: float | None = None
     """Weight lambda of the length loss."""
     outlier_deviations: float = 3.0
-    """Median absolute deviations by which the path length of a track may differ from the median before the track is dropped; 0
-    drops none."""
+    """Maximum difference of a track's path length from the median, in median absolute deviations; 0 drops no track."""
     future: int = 5
-    """Steps that training predicts in a row."""
+    """Number F of consecutive steps that training predicts."""
     yaw: bool = True
-    """Turn each training window by a random angle about the vertical."""
+    """Rotate each training window by a random angle about the vertical."""
     learning_rate: float = 1e-3
     """Adam's learning rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Settings of graphs and of the network's inputs. A rollout needs these and the weights. Meanings as in GsDynamicsTraining."""
+    """Settings of graphs and network inputs. A rollout needs them and the weights. Meanings are those of GsDynamicsTraining."""
 
     radius: float
     neighbors: int
@@ -97,7 +96,7 @@ class Rules:
     width: int
     step: float
     heights: bool
-    """Nodes know their heights and displacements in the history."""
+    """Inputs of nodes include their heights and displacements in the history."""
 
     @property
     def node_size(self) -> int:
@@ -106,13 +105,13 @@ class Rules:
 
     @property
     def edge_size(self) -> int:
-        """Inputs per edge: kinds 2 + 2, whether they differ 1, receiver - sender 3 H."""
+        """Inputs per edge: kinds 2 + 2, difference of the kinds 1, receiver - sender 3 H."""
         return 5 + 3 * HISTORY
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Settings of the training alone. Meanings as in GsDynamicsTraining."""
+    """Settings that only training needs. Meanings are those of GsDynamicsTraining."""
 
     noise: float
     yaw: bool
@@ -122,14 +121,14 @@ class Recipe:
 
 def preset_name(category: str) -> PresetName:
     """The preset of an object's category."""
-    # The cables of the motion-capture data are DLO1, DLO2, ...
+    # Cables in motion capture are called DLO1, DLO2, ...
     if category == "rope" or category.startswith("DLO"):
         return "rope"
     return "cloth" if category in CLOTHS else "animals"
 
 
 def resolve(settings: GsDynamicsTraining, category: str) -> tuple[Rules, Recipe]:
-    """The settings of a model and of its training, with every None replaced by the value of the preset."""
+    """The settings of a model and of its training; the preset replaces every None."""
     values = dict(zip(PRESET_COLUMNS, PRESETS[preset_name(category)], strict=True))
     values |= {"coverage": COVERAGE} | {name: value for name, value in vars(settings).items() if value is not None}
     rules, recipe = ({field.name: values[field.name] for field in fields(kind)} for kind in (Rules, Recipe))
@@ -138,30 +137,31 @@ def resolve(settings: GsDynamicsTraining, category: str) -> tuple[Rules, Recipe]
 
 @dataclass(frozen=True, eq=False)
 class ParticleGraph:
-    """Directed edges among nodes 0..N-1. The first nodes are particles, the others tools."""
+    """Directed edges among nodes 0..N-1. Particles come first, then tools."""
 
     receivers: torch.Tensor
-    """[E] int64."""
+    """Receiving nodes [E], int64."""
     senders: torch.Tensor
-    """[E] int64."""
+    """Sending nodes [E], int64."""
     particles: int
 
     @property
     def among_particles(self) -> torch.Tensor:
-        """[E] bool: edges without a tool."""
+        """Whether an edge connects two particles [E], bool."""
         return (self.receivers < self.particles) & (self.senders < self.particles)
 
 
 def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules: Rules) -> ParticleGraph:
     """The graph of B windows with points [B, K, 3] and tools [B, C, 3], m. Points with used [B, K] are particles.
 
-    A particle receives from its k nearest particles, itself included, as far as they are within the radius. Between a particle and
-    a tool within the radius there are edges both ways. There are none between tools, and none between windows. The nodes are the
-    particles of window 0, of window 1, ..., then the tools of window 0, of window 1, ...
+    - A particle receives from its k nearest particles within the radius, including itself.
+    - A particle and a tool within the radius have edges in both directions.
+    - Tools have no edges among each other, and windows have no edges in common.
+    - Nodes are the particles of window 0, 1, ..., then the tools of window 0, 1, ...
     """
     count = int(used.sum())
     number = (used.flatten().cumsum(0) - 1).view(used.shape)
-    # Not by products of matrices: a particle's distance from itself must be 0.
+    # Matrix products would round the distance of a particle from itself, which must be 0.
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     distances = distances.masked_fill(~used[:, None, :], torch.inf)
     distance, near = distances.topk(min(rules.neighbors, points.shape[1]), dim=2, largest=False)
@@ -176,10 +176,10 @@ def connect(points: torch.Tensor, used: torch.Tensor, tools: torch.Tensor, rules
 def sample(
     points: torch.Tensor, usable: torch.Tensor, most: int, coverage: float, first: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Farthest-point samples of B clouds at once: indices [B, K] into points [B, M, 3], and which entries are used [B, K].
+    """Farthest-point samples of B clouds: indices [B, K] into points [B, M, 3], and which entries are used [B, K].
 
-    A sample starts at point first [B] and adds the usable [B, M] point that is farthest from it, up to `most` points or until all
-    points lie within `coverage`, m. The public code's two passes give the same: `most` points, then as many of these as cover.
+    A sample starts at point `first` [B] and adds the farthest usable [B, M] point, until it has `most` points or all points are
+    within `coverage`, m. The result equals that of the two passes of the public code.
     """
     rows = torch.arange(len(points), device=points.device)
     distance = torch.where(usable, torch.inf, -torch.inf).to(points.dtype)
@@ -196,7 +196,7 @@ def sample(
 
 
 class Dynamics(torch.nn.Module):
-    """The network. A model file holds its weights as one vector [W]: the parameters in their order, matrix before bias."""
+    """The network. Its weights are one vector [W]: the parameters in order, with each matrix before its bias."""
 
     def __init__(self, rules: Rules) -> None:
         super().__init__()
@@ -208,14 +208,14 @@ class Dynamics(torch.nn.Module):
 
     @classmethod
     def of(cls, rules: Rules, weights: torch.Tensor) -> Dynamics:
-        """The network with weights [W], on their device and of their dtype; it shares their memory."""
+        """The network with weights [W]; it has their device and dtype and shares their memory."""
         network = cls(rules).to(weights)
         vector_to_parameters(weights, network.parameters())
         return network
 
     @classmethod
     def initial(cls, rules: Rules, seed: int, device: str = "cpu") -> Dynamics:
-        """The network with weights as torch starts linear layers: uniform in +- 1 / sqrt(inputs)."""
+        """The network with Torch's initial weights of linear layers: uniform in +- 1 / sqrt(inputs)."""
         generator = torch.Generator().manual_seed(seed)
         layers = [layer for layer in cls(rules).modules() if isinstance(layer, torch.nn.Linear)]
         draws = [
@@ -256,7 +256,10 @@ def _encoder(inputs: int, width: int) -> torch.nn.Sequential:
 
 
 def node_inputs(rules: Rules, graph: ParticleGraph, history: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """[N, `node_size`]: kind; heights and displacements in the history [H, N, 3], if asked for; action, 0 for particles."""
+    """Inputs of nodes [N, `node_size`]: kind, optional heights and displacements of the history [H, N, 3], action.
+
+    The action of particles is 0.
+    """
     nodes = history.shape[1]
     parts = [_kinds(torch.arange(nodes, device=history.device) < graph.particles, history)]
     if rules.heights:
@@ -265,7 +268,7 @@ def node_inputs(rules: Rules, graph: ParticleGraph, history: torch.Tensor, actio
 
 
 def edge_inputs(graph: ParticleGraph, history: torch.Tensor) -> torch.Tensor:
-    """[E, `edge_size`]: kinds of receiver and sender, 1 between particle and tool, receiver - sender in each step H."""
+    """Inputs of edges [E, `edge_size`]: both kinds, 1 between particle and tool, receiver - sender in each of H steps."""
     receives, sends = graph.receivers < graph.particles, graph.senders < graph.particles
     between = history.index_select(1, graph.receivers) - history.index_select(1, graph.senders)
     differs = (receives != sends).to(history.dtype)[:, None]
@@ -284,7 +287,7 @@ def weight_count(rules: Rules) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class GsDynamicsModel(Artifact):
-    """A trained model. It knows no object: it moves the structure points of any scenario."""
+    """A trained model. It contains no object and moves the structure points of any scenario."""
 
     kind: ClassVar[str] = "gs_dynamics"
     weights: np.ndarray = array("W", np.float32, "1", "parameters of Dynamics in their order")
@@ -301,10 +304,10 @@ class GsDynamicsModel(Artifact):
 
 
 def predict(model: GsDynamicsModel, observations: Observations, splats: np.ndarray | None, device: str) -> Prediction:
-    """Structure points in all frames, from those of frame 0 and the controllers; nothing else of the object is read.
+    """Structure points in all frames, predicted from the points of frame 0 and the controllers only.
 
-    For a transfer, the observations are the target's and the model is the source's. The published transfers started from the
-    source's points, registered to the target. The model has no splats of its own.
+    For a transfer, the observations are those of the target and the model is that of the source. The published transfers started
+    from the source's points, registered to the target. The model has no splats of its own.
     """
     up = observations.scenario.up
     tools = upright(observations.controller_points, up)
@@ -336,9 +339,9 @@ def predict(model: GsDynamicsModel, observations: Observations, splats: np.ndarr
 
 
 def make_step(dynamics: Dynamics, history: torch.Tensor, tools: torch.Tensor) -> tuple[torch.Tensor, int, int]:
-    """Structure points [N, 3], m, after one step, from history [H, N, 3] and tools [H + 1, C, 3], m, of which the last is ahead.
+    """Structure points [N, 3], m, after one step, from the history [H, N, 3] and tools [H + 1, C, 3], m.
 
-    Returns the number of particles and of edges between them and tools, too.
+    The last tools are those after the step. Returns also the numbers of particles and of contacts between particles and tools.
     """
     rules, now = dynamics.rules, history[-1]
     first = torch.zeros(1, dtype=torch.long, device=now.device)
@@ -356,17 +359,17 @@ def make_step(dynamics: Dynamics, history: torch.Tensor, tools: torch.Tensor) ->
 
 
 def in_every_frame(steps: list[int], positions: np.ndarray, frames: int) -> np.ndarray:
-    """Positions [frames, N, 3], m, of which those [S, N, 3] in the frames `steps` are given.
+    """Positions in all frames [frames, N, 3], m, from those in the frames `steps` [S, N, 3].
 
-    Between two steps points move on straight lines, which needs the next step and so works offline only; after the last they stay.
+    Points move on straight lines between two steps, which only works offline, and rest after the last step.
     """
     given_frames, frame = np.array(steps), np.arange(frames)
     before = np.searchsorted(given_frames, frame, side="right") - 1
     after = np.minimum(before + 1, len(given_frames) - 1)
     span = np.maximum(given_frames[after] - given_frames[before], 1)
-    part = ((frame - given_frames[before]) / span).astype(positions.dtype)[:, None, None]
-    # Exact where the two are the same.
-    return np.asarray(positions[before] + part * (positions[after] - positions[before]))
+    fraction = ((frame - given_frames[before]) / span).astype(positions.dtype)[:, None, None]
+    # This form is exact for equal positions.
+    return np.asarray(positions[before] + fraction * (positions[after] - positions[before]))
 
 
 def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
@@ -377,7 +380,7 @@ def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> to
     order = np.argsort(receivers, kind="stable")
     receivers, senders = receivers[order], senders[order]
     slot = np.arange(len(receivers)) - np.searchsorted(receivers, receivers)
-    # Neighbors [P, k] of each particle. Empty places hold the particle itself, which adds no offset.
+    # Neighbors [P, k] of each particle. Empty slots contain the particle itself, whose offset is zero.
     neighbors = np.repeat(np.arange(count, dtype=np.int32)[:, None], int(slot.max(initial=0)) + 1, axis=1)
     neighbors[receivers, slot] = senders
     # With a hundred particles the CPU is as fast as any device.
@@ -390,11 +393,11 @@ def turns(graph: ParticleGraph, before: torch.Tensor, after: torch.Tensor) -> to
 
 
 def carry(points: torch.Tensor, particles: torch.Tensor, rotations: torch.Tensor, displacements: torch.Tensor) -> torch.Tensor:
-    """Points [N, 3] m after particles [P, 3] m with rotations [P, 3, 3] moved by displacements [P, 3], m."""
+    """Points [N, 3] after particles [P, 3] with rotations [P, 3, 3] moved by displacements [P, 3], all in m."""
     weights = 1 / torch.cdist(points, particles, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=MIN_PARTICLE_DISTANCE)
     weights = weights / weights.sum(dim=1, keepdim=True)
     bend = rotations - torch.eye(3, dtype=points.dtype, device=points.device)
-    # sum_b w_b [B_b (x - b) + u_b] = (sum_b w_b B_b) x + sum_b w_b (u_b - B_b b), relative to a center to keep digits.
+    # sum_b w_b [B_b (x - b) + u_b] = (sum_b w_b B_b) x + sum_b w_b (u_b - B_b b); a center keeps precision.
     center = particles.mean(dim=0)
     shift = displacements - torch.einsum("bij,bj->bi", bend, particles - center)
     turned = torch.einsum("nij,nj->ni", (weights @ bend.flatten(1)).view(-1, 3, 3), points - center)
@@ -402,14 +405,14 @@ def carry(points: torch.Tensor, particles: torch.Tensor, rotations: torch.Tensor
 
 
 def upright(points: np.ndarray, up: Up) -> np.ndarray:
-    """Points [..., 3], m, of a world with this `up` in one with +z up. Applied twice, it changes nothing."""
+    """Points [..., 3], m, from a world with this `up` to one with +z up, or back."""
     return points.astype(np.float32) if up == "+z" else points.astype(np.float32) * HALF_TURN
 
 
 def steps(tools: np.ndarray, frames: Iterable[int], step: float, last_accepted: float = 1.0) -> Iterator[int]:
-    """The first of `frames`, then each in which any tool of [T, C, 3] has moved `step`, m, since the one before.
+    """The first of `frames`, then each frame in which a tool of [T, C, 3] has moved by `step`, m, since the previous one.
 
-    The last frame of the recording needs only `last_accepted` of a step.
+    The last frame of the recording needs only the fraction `last_accepted` of a step.
     """
     latest = None
     for frame in frames:
@@ -420,5 +423,5 @@ def steps(tools: np.ndarray, frames: Iterable[int], step: float, last_accepted: 
 
 
 def executed(tools: np.ndarray, step: float) -> list[int]:
-    """Frames in which a rollout makes a step: those in which tools [T, C, 3] have moved `step`, m, since the one before."""
+    """Frames in which a rollout makes a step: a tool of [T, C, 3] has moved by `step`, m, since the previous one."""
     return list(steps(tools, range(len(tools)), step))[1:]

@@ -1,11 +1,12 @@
-"""Training of GS-Dynamics: Adam on random windows of the training frames, with the loss of several predicted steps in a row.
+"""Training of GS-Dynamics: Adam on random windows of the training frames, with the loss of several consecutive predicted steps.
 
-Each epoch has its own random generator, so a continued training draws what an uninterrupted one does. A loss or gradient that is
-not finite ends training as a named failure with the latest weights whose loss was finite. A capture without windows keeps its
-initial weights, but for a last layer of zeros, so that it moves nothing. The last epoch is the result.
+- Each epoch has its own random generator, so a resumed training draws the same windows.
+- A loss or gradient that is not finite ends training as a failure, with the latest weights that had a finite loss.
+- For a capture without windows, the last layer becomes zero, so that the object does not move.
+- The result is the last epoch.
 
-Training sees smoothed tracks without outliers and the tools, which are the controllers, with +z up, in windows around every frame.
-A window has H steps of history and F steps of future. A step is `step` m of tool motion.
+The data are smoothed tracks without outliers, and the tools, which are the controllers; +z is up. A window around a frame has H
+steps of history and F steps of future. A step is `step` m of tool motion.
 """
 
 from __future__ import annotations
@@ -42,14 +43,15 @@ from neuspring.extensions.gs_dynamics.model import (
 )
 
 DENSE_POINTS = 1000
-"""Most tracks from which particles are drawn."""
+"""Maximum number of tracks from which particles are sampled."""
 MIN_VISIBLE = 20
-"""Least tracks that must be seen in all frames of a window. Where fewer are, the window takes those seen in its history, and the
-losses leave out what is not seen."""
+"""Minimum number of tracks that are visible in all frames of a window.
+
+With fewer, the window uses all tracks that are visible in its history, and losses omit invisible points."""
 SMOOTHING_PASSES = 10
-"""Passes of a moving average over three frames on the visible part of tracks."""
+"""Passes of a moving average over three frames on the visible points of tracks."""
 LAST_ACCEPTED = 0.75
-"""Part of a step that suffices for the last training frame to end a step."""
+"""Fraction of a step that suffices in the last training frame."""
 GS_DYNAMICS_METRICS = ("loss", "position_loss", "length_loss")
 
 
@@ -58,17 +60,17 @@ class Tracks:
     """Tracks and tools in T training frames."""
 
     points: np.ndarray
-    """[T, M, 3] m; without meaning where not visible."""
+    """Positions [T, M, 3], m; undefined where invisible."""
     visible: np.ndarray
-    """[T, M] bool."""
+    """Visibility [T, M], bool."""
     tools: np.ndarray
-    """[T, C, 3] m."""
+    """Positions of the tools [T, C, 3], m."""
     dropped: int
-    """Number of tracks that were outliers."""
+    """Number of dropped outliers."""
 
     @classmethod
     def of(cls, observations: Observations, settings: GsDynamicsTraining) -> Tracks:
-        """Tracks and tools of the training frames of a capture; nothing else of it is read."""
+        """Tracks and tools of the training frames of a capture."""
         train, up = slice(observations.scenario.train_end), observations.scenario.up
         points, visible = upright(observations.object_points[train], up), observations.object_visibility[train]
         inliers = np.flatnonzero(ordinary(points, visible, settings.outlier_deviations))
@@ -79,10 +81,10 @@ class Tracks:
 
 
 def ordinary(points: np.ndarray, visible: np.ndarray, deviations: float) -> np.ndarray:
-    """[M] bool: tracks whose path length is less than `deviations` median absolute deviations from the median.
+    """Which tracks [M] have a path length within `deviations` median absolute deviations of the median.
 
-    A path length is a point's mean motion over pairs of successive frames that see it, times the number of all pairs. A track
-    without such a pair is dropped. All tracks stay with `deviations` 0, and all with a path where the deviation is 0.
+    The path length is the mean motion over pairs of successive frames with a visible point, times the number of all pairs. Tracks
+    without such a pair are dropped. With `deviations` 0 all tracks stay; if the deviation is 0, all tracks with a path stay.
     """
     both = visible[1:] & visible[:-1]
     steps = np.where(both, np.linalg.norm(np.diff(points, axis=0), axis=2), 0.0)
@@ -97,7 +99,7 @@ def ordinary(points: np.ndarray, visible: np.ndarray, deviations: float) -> np.n
 
 
 def smoothed(points: np.ndarray, visible: np.ndarray, passes: int) -> np.ndarray:
-    """Points [T, M, 3] after moving averages over three frames of the visible [T, M] ones. Invisible points stay."""
+    """Points [T, M, 3] after moving averages over three frames; only visible [T, M] points are averaged and changed."""
 
     def three(values: np.ndarray) -> np.ndarray:
         total = values.copy()
@@ -114,19 +116,19 @@ def smoothed(points: np.ndarray, visible: np.ndarray, passes: int) -> np.ndarray
 
 
 def past(tools: np.ndarray, frame: int, step: float) -> list[int]:
-    """H frames up to `frame`, oldest first, a step apart; where there are fewer, the oldest is repeated."""
+    """H frames up to `frame`, oldest first, one step apart; if there are fewer, the oldest is repeated."""
     frames = list(islice(steps(tools, range(frame, -1, -1), step), HISTORY))
     return [frames[-1]] * (HISTORY - len(frames)) + frames[::-1]
 
 
 def ahead(tools: np.ndarray, frame: int, step: float, count: int) -> list[int]:
-    """`count` frames after `frame`, a step apart; where there are fewer, the latest is repeated. Empty where there is none."""
+    """`count` frames after `frame`, one step apart; if there are fewer, the latest is repeated; if there is none, empty."""
     frames = list(islice(steps(tools, range(frame, len(tools)), step, LAST_ACCEPTED), 1, count + 1))
     return frames + frames[-1:] * (count - len(frames))
 
 
 def window_frames(tools: np.ndarray, settings: GsDynamicsTraining) -> np.ndarray:
-    """Frames [W, H + F] of each window. A frame without a step ahead has none, as nothing moves there in a rollout."""
+    """Frames of each window [W, H + F]. Frames without a step ahead have no window, because a rollout does not move there."""
     rows = []
     for frame in range(len(tools)):
         future = ahead(tools, frame, settings.step, settings.future)
@@ -140,15 +142,15 @@ class Windows:
     """The windows of a capture, on a device."""
 
     frames: torch.Tensor
-    """[W, H + F] int64."""
+    """Frames of each window [W, H + F], int64."""
     usable: torch.Tensor
-    """[W, M] bool: tracks that may become particles: those seen in the whole history, so every input is a measured position."""
+    """Tracks that may become particles [W, M], bool. They are visible in the full history, so every input was measured."""
     points: torch.Tensor
-    """[T, M, 3] m."""
+    """Positions of tracks [T, M, 3], m."""
     visible: torch.Tensor
-    """[T, M] bool."""
+    """Visibility of tracks [T, M], bool."""
     tools: torch.Tensor
-    """[T, C, 3] m."""
+    """Positions of the tools [T, C, 3], m."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -157,7 +159,7 @@ class Windows:
     def of(cls, tracks: Tracks, settings: GsDynamicsTraining, device: str) -> Windows:
         """All windows in which at least one track may become a particle.
 
-        These are tracks visible in all frames of the window. Fallback if fewer than MIN_VISIBLE: visible in the history only.
+        Tracks must be visible in all frames of the window; if fewer than MIN_VISIBLE are, only in its history.
         """
         frames = window_frames(tracks.tools, settings)
         seen = tracks.visible[frames]
@@ -171,17 +173,17 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """A batch of windows. All together have P particles and C tools, N = P + C nodes."""
+    """A batch of windows with P particles and C tools in total, N = P + C nodes."""
 
     graph: ParticleGraph
     history: torch.Tensor
-    """[H, N, 3] m, with noise."""
+    """Positions of nodes with noise [H, N, 3], m."""
     tools: torch.Tensor
-    """[F, C, 3] m, as recorded."""
+    """Recorded positions of tools [F, C, 3], m."""
     targets: torch.Tensor
-    """[F, P, 3] m."""
+    """Recorded positions of particles [F, P, 3], m."""
     known: torch.Tensor
-    """[F, P] bool: whether the target was seen."""
+    """Visibility of targets [F, P], bool."""
 
 
 def draw(windows: Windows, rules: Rules, recipe: Recipe, generator: torch.Generator) -> Batch:
@@ -217,14 +219,14 @@ def draw(windows: Windows, rules: Rules, recipe: Recipe, generator: torch.Genera
 
 
 def pick(usable: torch.Tensor, chance: torch.Tensor) -> torch.Tensor:
-    """Index [B] of one of the usable [B, M] entries of each row, for a uniform draw `chance` [B] in [0, 1)."""
+    """Index [B] of a random usable [B, M] entry of each row, for a uniform draw `chance` [B] in [0, 1)."""
     counts = usable.sum(dim=1)
     rank = torch.minimum((chance * counts).long(), counts - 1)
     return (usable.cumsum(dim=1) > rank[:, None]).to(torch.uint8).argmax(dim=1)
 
 
 def rotations(chance: torch.Tensor) -> torch.Tensor:
-    """Rotations [B, 3, 3] about z by the fraction `chance` [B] of a whole turn."""
+    """Rotations [B, 3, 3] about z by the fraction `chance` [B] of a full turn."""
     angle = chance * 2 * math.pi
     turn = torch.zeros(len(chance), 3, 3)
     turn[:, 0, 0] = turn[:, 1, 1] = angle.cos()
@@ -235,9 +237,9 @@ def rotations(chance: torch.Tensor) -> torch.Tensor:
 
 
 def unroll(dynamics: Dynamics, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Position loss and length loss, m^2, each summed over the predicted steps. The length loss has no weight yet.
+    """Position loss and unweighted length loss, m^2, each summed over the predicted steps.
 
-    The edges of the first graph stay. Tools move as recorded.
+    All steps use the edges of the first graph. Tools move as recorded.
     """
     particles = batch.graph.particles
     state, tools = batch.history[:, :particles], batch.history[:, particles:]
@@ -258,12 +260,12 @@ def position_loss(after: torch.Tensor, target: torch.Tensor, known: torch.Tensor
 
 
 def length_loss(graph: ParticleGraph, after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-    """Mean squared change of the lengths of edges among particles, `before` to `after` [P, 3], m^2.
+    """Mean squared change of the lengths of edges among particles, from `before` to `after` [P, 3], m^2.
 
-    An edge of a particle to itself counts, with no change.
+    The mean includes edges of particles to themselves, which do not change.
     """
     receivers, senders = graph.receivers[graph.among_particles], graph.senders[graph.among_particles]
-    # A clone has the gradients of both ends added before those of the other loss: results keep their last bits.
+    # The clone fixes the order in which gradients are added, so that results stay the same to the last bit.
     lengths = [(points[receivers] - points[senders]).norm(dim=1) for points in (after.clone(), before)]
     squares: torch.Tensor = (lengths[0] - lengths[1]).square()
     return squares.mean()
@@ -284,8 +286,8 @@ class GsDynamicsTrainer:
         """The latest weights whose loss was finite."""
 
     def epoch(self, number: int) -> dict[str, float]:
-        """Means over the updates of an epoch. Raises TrainingStopped."""
-        # Stateless, so that a continued training draws the same windows.
+        """Run one epoch; returns means over its updates. Raises TrainingStopped."""
+        # The generator depends only on seed and epoch, so that a resumed training draws the same windows.
         (state,) = np.random.SeedSequence([self.seed, number]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state >> np.uint64(1)))
         updates = range(self.settings.updates_per_epoch)
@@ -293,7 +295,7 @@ class GsDynamicsTrainer:
         return dict(zip(GS_DYNAMICS_METRICS, np.mean(rows, axis=0).tolist(), strict=True))
 
     def update(self, generator: torch.Generator, where: str) -> list[float]:
-        """One optimizer step; returns the loss, the position loss and the length loss before its weight, m^2."""
+        """Make one optimizer step; returns the loss, the position loss and the unweighted length loss, m^2."""
         position, length = unroll(self.network, draw(self.windows, self.rules, self.recipe, generator))
         loss = position + self.recipe.length_weight * length
         self.optimizer.zero_grad(set_to_none=True)
@@ -313,11 +315,11 @@ class GsDynamicsTrainer:
         raise TrainingStopped(reason)
 
     def model(self) -> GsDynamicsModel:
-        """The model with the present weights."""
+        """The model with the current weights."""
         return GsDynamicsModel(weights=self.network.weights.cpu().numpy(), rules=self.rules)
 
     def checkpoint(self) -> Checkpoint:
-        """Everything that a continued training needs."""
+        """The state from which training resumes."""
         return Checkpoint({"network": {"weights": self.network.weights.cpu().numpy()}, "adam": adam_arrays(self.optimizer)}, {})
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -340,11 +342,11 @@ class GsDynamicsTrainer:
 
 
 def train(request: TrainingRequest) -> Trained[GsDynamicsModel]:
-    """Train on the tracks of the training frames; continue a checkpoint with the same key."""
+    """Train on the tracks of the training frames; resumes from a checkpoint with the same key."""
     training, settings = GsDynamicsTrainer(request), request.settings.baselines.gs_dynamics
     if len(training.windows):
         return run_epochs(training, GS_DYNAMICS_METRICS, settings.epochs, request.partial, request.key())
-    # A network that learned nothing must not move the object at random.
+    # An untrained network must not move the object at random.
     with torch.no_grad():
         for parameter in training.network.head[-1].parameters():
             parameter.zero_()

@@ -1,4 +1,4 @@
-"""PhysTwin's release: fetch the archives, read the results, compare them with ours and with the published scores.
+"""PhysTwin's release: fetch the archives, read the results, compare them with this code and with the published scores.
 
-The real archives and the real hub have not been met yet: the readers are written to the described layout.
+The readers follow a description of the layout; they are untested with the real archives and the real hub.
 """

@@ -1,4 +1,4 @@
-"""Commands `fetch` and `verify-released`."""
+"""The commands `fetch` and `verify-released`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neuspring.cli.options import Positional, arg
 
 def fetch(
     source: Positional[Literal["phystwin"]],
-    scenarios: Annotated[Positional[tuple[str, ...]], arg(help="all 22 by default")] = (),
+    scenarios: Annotated[Positional[tuple[str, ...]], arg(help="default: all 22")] = (),
     *,
     data_root: Annotated[Path, arg(help="folder to write to; data_root of the configuration")],
     parts: Annotated[
@@ -19,9 +19,9 @@ def fetch(
         arg(help="data: processed cases; results: predictions, checkpoints, parameters; images: color, depth, masks"),
     ] = ("data", "results"),
     revision: Annotated[str, arg(help="branch, tag or commit of the data set")] = "main",
-    dry_run: Annotated[bool, arg(help="print the sizes alone")] = False,
+    dry_run: Annotated[bool, arg(help="only print the sizes")] = False,
 ) -> int:
-    """Released archives -> the folders that the readers expect; exit status 2 if a fetched file is damaged."""
+    """Fetch PhysTwin's released files into the folders that readers expect; exit status 2 if a fetched file is damaged."""
     from neuspring.extensions.released import fetch
 
     fetch.fetch(data_root, scenarios, parts, revision, dry_run=dry_run)
@@ -29,11 +29,11 @@ def fetch(
 
 
 def verify_released(
-    data_root: Annotated[Positional[Path], arg(help="folder that holds data, experiments and experiments_optimization")],
+    data_root: Annotated[Positional[Path], arg(help="folder that contains data, experiments and experiments_optimization")],
     output: Annotated[Path, arg(help="folder to write to")],
-    scenarios: Annotated[tuple[str, ...], arg(help="all that are there by default")] = (),
+    scenarios: Annotated[tuple[str, ...], arg(help="default: all in this folder")] = (),
 ) -> int:
-    """PhysTwin's released results, compared with ours; exit status 1 if one differs, 2 if nothing could be compared."""
+    """Compare PhysTwin's released results with this code; exit status 1 if one differs, 2 if no comparison is possible."""
     from neuspring.extensions.released import verify
 
     table = verify.verify_released(data_root, output, scenarios)

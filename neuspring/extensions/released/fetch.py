@@ -1,7 +1,7 @@
-"""`neuspring fetch phystwin`: the released PhysTwin archives, from the Hugging Face hub into the folders that readers expect.
+"""`neuspring fetch phystwin`: files of PhysTwin's release, from the Hugging Face hub to the folders that readers expect.
 
-Only the requested files are read, by HTTP range requests, and no archive is stored. A file whose size and CRC-32 equal those of its
-archive member is complete; the same command continues an interrupted fetch.
+HTTP range requests read only the requested files; no archive is stored. A file is complete if its size and CRC-32 equal those of
+the archive member. The same command resumes an interrupted fetch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TREES = {
     "experiments": "experiments.zip",
     "experiments_optimization": "experiments_optimization.zip",
 }
-"""Folder below data_root -> the archive that holds it."""
+"""Folder below data_root -> the archive that contains it."""
 PARTS = {
     "data": {"data/different_types": r"(?:final_data|gt_track_3d|calibrate)\.pkl|(?:split|metadata)\.json"},
     "images": {
@@ -36,15 +36,15 @@ PARTS = {
     },
     "results": {"experiments": r"inference\.pkl|train/best_\d+\.pth", "experiments_optimization": r"optimal_params\.pkl"},
 }
-"""Part -> its folders, and the names of files below the folder of a case there. Nothing else is ever written."""
+"""Part -> its folders, and the names of files in the folder of a case there. No other file is written."""
 
 
 def fetch(
     data_root: Path, scenarios: Sequence[str], parts: Sequence[str], revision: str = "main", *, dry_run: bool = False
 ) -> None:
-    """Fetch `parts` (keys of PARTS) of `scenarios` (default: all 22) below `data_root`; a dry run prints sizes alone.
+    """Fetch `parts` (keys of PARTS) of `scenarios` (default: all 22) to `data_root`; a dry run only prints sizes.
 
-    Raises InputError for unknown names, for an archive that is damaged or has none of the files, and where hub or disk fail.
+    Raises InputError for unknown names, for an archive that is damaged or has none of the files, and for errors of hub or disk.
     """
     for where, names, known in (("SCENARIO", scenarios, released_cases()), ("--parts", parts, PARTS)):
         if unknown := [name for name in names if name not in known]:
@@ -66,16 +66,16 @@ def fetch(
 
 
 def _extract(archive: zipfile.ZipFile, pattern: re.Pattern[str], folder: Path, name: str, dry_run: bool) -> None:
-    """Write the members that match below `folder`, those with a complete file left out."""
+    """Write the matching members to `folder`, except complete files."""
     wanted = {folder / match[1]: info for info in archive.infolist() if (match := pattern.fullmatch(info.filename))}
     if not wanted:
         first = ", ".join(archive.namelist()[:8])
-        raise InputError(name, f"must contain files {pattern.pattern}", "none", f"Its first paths: {first}.")
+        raise InputError(name, f"must contain files {pattern.pattern}", "none", f"Check --revision. The first paths are {first}.")
     missing = {path: info for path, info in wanted.items() if not _is_complete(path, info)}
     size = sum(info.compress_size for info in missing.values()) / 1e6
-    print(f"{name}: {len(wanted)} files, {len(missing)} of them to fetch ({size:,.1f} MB)")
+    print(f"{name}: {len(wanted)} files; {len(missing)} are missing ({size:,.1f} MB)")
     progress = Progress(f"{name}: files", len(missing))
-    # In the archive's order, so that the data read ahead are used.
+    # The archive's order makes use of the data that are read ahead.
     for count, path in enumerate(sorted(missing, key=lambda path: missing[path].header_offset) if not dry_run else (), start=1):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.part")

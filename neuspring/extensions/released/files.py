@@ -1,6 +1,6 @@
 """Readers of PhysTwin's released results: searched parameters, checkpoint and prediction of a case.
 
-Every reader raises InputError naming the file. None runs code that a file contains.
+Every reader raises InputError with the name of the file. No reader runs code that a file contains.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SPRING_KEYS = ("object_radius", "object_max_neighbours", "controller_radius", "c
 
 @dataclass(frozen=True)
 class Released:
-    """The files of one case below the folder that the archives were unpacked in."""
+    """The files of one case in the folder of the unpacked archives."""
 
     root: Path
     name: str
@@ -35,7 +35,7 @@ class Released:
 
     @property
     def checkpoint(self) -> Path:
-        """best_{epoch}.pth of the highest epoch; best_0.pth where there is none."""
+        """best_{epoch}.pth of the highest epoch; best_0.pth if there is none."""
         folder = self.root / "experiments" / self.name / "train"
         return max(folder.glob("best_*.pth"), key=epoch, default=folder / "best_0.pth")
 
@@ -52,12 +52,12 @@ def epoch(checkpoint: Path) -> int:
 
 
 def read_parameters(path: Path) -> dict[str, float]:
-    """The numbers of optimal_params.pkl that springs are made with (`SPRING_KEYS`): m and counts."""
+    """The numbers in optimal_params.pkl that define springs (`SPRING_KEYS`): radii, m, and counts."""
     parameters = load_pickle(path)
     try:
         read = {key: float(parameters[key]) for key in SPRING_KEYS}
     except (TypeError, KeyError, ValueError, OverflowError) as error:
-        raise InputError(path, f"the numbers {', '.join(SPRING_KEYS)} are required", f"{type(error).__name__}: {error}") from error
+        raise InputError(path, f"must have the numbers {', '.join(SPRING_KEYS)}", f"{type(error).__name__}: {error}") from error
     if not all(0 < value < np.inf for value in read.values()):
         raise InputError(path, f"{', '.join(SPRING_KEYS)} must be positive and finite", read)
     return read
@@ -65,14 +65,14 @@ def read_parameters(path: Path) -> dict[str, float]:
 
 def read_checkpoint(path: Path) -> tuple[np.ndarray, int]:
     """Stiffness of every spring [S] and the number of springs between object nodes, of best_{epoch}.pth."""
-    import torch  # slow to import, and needed for this file alone
+    import torch  # Slow to import, and only this file needs it.
 
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
         return stored["spring_Y"].detach().numpy(), int(stored["num_object_springs"])
-    except Exception as error:  # torch names no closed set of exceptions for damaged or refused files
+    except Exception as error:  # Torch documents no set of exceptions for damaged or refused files.
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        rule = "a checkpoint with spring_Y and num_object_springs is required (read with weights_only)"
+        rule = "must be a checkpoint with spring_Y and num_object_springs (read with weights_only)"
         raise InputError(path, rule, reason) from error
 
 
@@ -81,5 +81,5 @@ def read_prediction(path: Path, frames: int, nodes: int) -> np.ndarray:
     positions = load_pickle(path)
     if not isinstance(positions, np.ndarray) or positions.dtype.kind != "f" or positions.shape != (frames, nodes, 3):
         received = f"{positions.shape} {positions.dtype}" if isinstance(positions, np.ndarray) else type(positions).__name__
-        raise InputError(path, f"floating point positions of shape {(frames, nodes, 3)} are required", received)
+        raise InputError(path, f"must have floating-point positions of shape {(frames, nodes, 3)}", received)
     return np.asarray(positions, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""`neuspring verify-released`: PhysTwin's released results against our readers, springs and metrics, and the published scores."""
+"""`neuspring verify-released`: compares PhysTwin's released results with this code and with the published scores."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from neuspring.scores.paper import Values, released_scores
 
 COLUMNS = ("scenario", "task", "quantity", "ours", "published", "tolerance", "outcome", "note")
 MEAN = "MEAN22_REEVAL"
-"""The name of the published means over the 22 cases, evaluated again with more digits than the paper prints."""
+"""Name of the published means over the 22 cases, evaluated again with more digits than in the paper."""
 Row = dict[str, Any]
 
 
 def verify_released(root: Path, output: Path, scenarios: Sequence[str] = (), published: Values | None = None) -> pd.DataFrame:
-    """Compare the released results below `root` (the folder that holds data, experiments, ...); write output/verify.csv.
+    """Compare the released results in `root` (the folder of data, experiments, ...); write output/verify.csv.
 
-    Returns one row per comparison (COLUMNS). outcome: passed, failed, measured (no published number), or skipped (a missing file).
-    `scenarios` defaults to all that are there, `published` to the table that ships. Raises InputError if there are no such cases.
+    Returns one row per comparison (COLUMNS). The outcome is passed, failed, measured (no published number) or skipped (a missing
+    file). `scenarios` defaults to all cases in `root`, `published` to the table of this package. Raises InputError without cases.
     """
     folder = root / "data" / "different_types"
     present = sorted(path.name for path in folder.glob("*/") if not path.name.startswith("."))
     if not present or (unknown := [name for name in scenarios if name not in present]):
-        rule = f"released cases are required: {', '.join(unknown) if present else 'at least one'}"
-        raise InputError(folder, rule, ", ".join(present) or "none", "Fetch them: `neuspring fetch phystwin --data-root ...`.")
+        rule = f"must contain released cases: {', '.join(unknown) if present else 'at least one'}"
+        raise InputError(folder, rule, ", ".join(present) or "none", "Run `neuspring fetch phystwin --data-root ...`.")
     values = released_scores() if published is None else published
     rows, names = list[Row](), list(scenarios) or present
     progress = Progress("verify", len(names))
@@ -76,7 +76,7 @@ def _compare(case: Released, published: Values) -> list[Row]:
 
 
 def _sizes(case: Released, observations: Observations) -> Iterator[Row]:
-    """Sizes of the case against the table of released cases."""
+    """Compare sizes of the case with the table of released cases."""
     sizes = {"frames": observations.scenario.frame_count, "train_end": observations.scenario.train_end}
     sizes |= {"object_points": observations.object_points.shape[1], "nodes": len(observations.nodes)}
     known = released_cases().get(case.name, {})
@@ -85,7 +85,7 @@ def _sizes(case: Released, observations: Observations) -> Iterator[Row]:
 
 
 def _springs(case: Released, observations: Observations, _: Values) -> Iterator[Row]:
-    """The springs that we build from the searched parameters against the checkpoint, and its epoch against the table."""
+    """Compare springs built from the searched parameters with the checkpoint, and its epoch with the table."""
     parameters, (stiffness, object_springs) = read_parameters(case.parameters), read_checkpoint(case.checkpoint)
     rebuilt = uniform_topology(
         observations.nodes,
@@ -103,7 +103,7 @@ def _springs(case: Released, observations: Observations, _: Values) -> Iterator[
 
 
 def _scores(case: Released, observations: Observations, published: Values) -> Iterator[Row]:
-    """Frame 0 of the released prediction against the nodes, and our metrics of it against the published scores."""
+    """Compare frame 0 of the released prediction with the nodes, and its metrics with the published scores."""
     positions = read_prediction(case.prediction, observations.scenario.frame_count, len(observations.nodes))
     moved = int((positions[0] != observations.nodes).any(axis=1).sum())
     note = "frame 0 must equal [object_points[0] | surface_points | interior_points] in float32"
@@ -126,15 +126,15 @@ def _score(scenario: str, task: str, metric: str, ours: float, published: Values
 
 
 def _row(case: Released | str, quantity: str, **values: Any) -> Row:
-    """One row; the outcome is judged unless it is given."""
+    """One row; without a given outcome, the difference and the tolerance decide."""
     row: Row = {"scenario": case if isinstance(case, str) else case.name, "quantity": quantity, "tolerance": 0.0} | values
     if "outcome" not in row:
         known = row["published"] is not None
-        close = known and bool(np.abs(row["ours"] - row["published"]) <= row["tolerance"])  # false for NaN
+        close = known and bool(np.abs(row["ours"] - row["published"]) <= row["tolerance"])  # False for NaN.
         row["outcome"] = ("passed" if close else "failed") if known else "measured"
     return row
 
 
 def _whole(known: Mapping[str, str], column: str) -> int | None:
-    """A count of the table of released cases; None where it is unknown."""
+    """A count in the table of released cases; None if it is unknown."""
     return int(known[column]) if known.get(column) else None

@@ -1,4 +1,4 @@
-"""The center line of a long thin body, found among its nodes: distances along the body, then a smooth curve (a principal curve)."""
+"""The center line of a long thin object, found among its nodes: a principal curve that starts from distances along the object."""
 
 from __future__ import annotations
 
@@ -9,30 +9,32 @@ from neuspring.extensions.rods.nodes import bind
 from neuspring.extensions.rods.rod import arc_of, pieces
 
 LEAST_SLENDERNESS = 8.0
-"""Length over radius below which a body is no rod: bending would shear it as much."""
+"""Minimum length of a rod, in radii. A shorter object would shear as much as it bends."""
 BESIDE_LINE, MOST_BESIDE = 3.0, 0.1
-"""Nodes farther from the line than this times the median lie beside it, and the largest part of them. A cylinder has none: at most
-1.4 times the median."""
+"""Distance from the line, in medians, above which a node is beside the line, and the maximum fraction of such nodes.
+
+A cylinder has none: its nodes are within 1.4 medians."""
 LINE_NEIGHBORS = 12
-"""Nearest nodes along which distances on the body are measured."""
+"""Number of nearest nodes along which distances on the object are measured."""
 MOST_LINE_NODES = 3000
-"""Nodes that decide on the line, at most; of more, evenly chosen ones."""
+"""Maximum number of nodes that are used to find the line; of more nodes, a regular subset is used."""
 LINE_ROUNDS = 4
-"""Fits of the line, each with the arc of the one before."""
+"""Fits of the line, each with the arc lengths of the previous fit."""
 LINE_SAMPLES = 400
-"""Points of the smooth line, to which nodes are projected."""
+"""Points of the smooth line onto which nodes are projected."""
 PIECES = 0.15
 """Pieces of the spline per radius of length: one in about seven radii, so that it does not follow the surface."""
 SPLINE_PENALTY = 1e-3
-"""Weight of the spline's second differences, where the mean weight of a piece's points is 1."""
+"""Weight of the spline's second differences, for a mean weight of 1 of a piece's points."""
 
 
 def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> np.ndarray:
-    """Vertices [count, 3], m, at equal distances along a smooth line through a long thin body of nodes [N, 3], m.
+    """Vertices [count, 3], m, at equal distances along a smooth line through the nodes [N, 3], m, of a long thin object.
 
-    A principal curve: the first arc of a node is its distance along the body from an end (the node farthest from the one that is
-    farthest from any). Then cubic splines x(s) are fitted, and each node takes the arc of the nearest point. Does not depend on the
-    order of the nodes. Raises InputError, naming `where`, if the body is not long and thin, or has branches.
+    The line is a principal curve. First, the arc length of a node is its distance along the object from an end: the node that is
+    farthest from the node that is farthest from any node. Then cubic splines x(s) are fitted, and each node gets the arc length
+    of the nearest point. The order of the nodes does not matter. Raises InputError, with the name `where`, if the object is not
+    long and thin, or has branches.
     """
     points = np.asarray(nodes, np.float64)
     points = points[np.lexsort(points.T)]
@@ -42,7 +44,7 @@ def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> n
     for _ in range(LINE_ROUNDS):
         line = _spline(arc, points, weights, int(np.clip(PIECES * slenderness, 2, count // 2)))
         arc, apart = _projected(points, line)
-        # What lies far beside the line, as points of a hand, hardly pulls it.
+        # Nodes far beside the line, for example points of a hand, get a small weight.
         typical = max(float(np.median(apart)), 1e-9)
         weights = 1 / (1 + (apart / (0.67 * BESIDE_LINE * typical)) ** 8)
         length = float(pieces(line).sum())
@@ -50,14 +52,14 @@ def center_line(nodes: np.ndarray, count: int, where: str = "observations") -> n
     limit = BESIDE_LINE * typical + 1e-3 * length
     beside = float((apart > limit).mean())
     if slenderness < LEAST_SLENDERNESS or beside > MOST_BESIDE:
-        rule = f"a rod is long and thin: its nodes lie around one line without branches, at least {LEAST_SLENDERNESS:g} radii long"
+        rule = f"a rod must be around one line without branches, at least {LEAST_SLENDERNESS:g} radii long"
         found = f"{slenderness:.1f} radii" if slenderness < LEAST_SLENDERNESS else f"{beside:.0%} of the nodes far beside the line"
         raise InputError(f"{where}, nodes of frame 0", rule, found, "Choose a method whose twin is a lattice.")
     return _equally_spaced(line, arc[apart < limit], count)
 
 
 def _from_an_end(points: np.ndarray) -> np.ndarray:
-    """Distance of each node along the body from one of its ends [N], m; the end that comes first in x, then y, z."""
+    """Distance of each node along the object from one of its ends [N], m: the end that is first by x, then y, then z."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
     from scipy.spatial import cKDTree
@@ -65,7 +67,7 @@ def _from_an_end(points: np.ndarray) -> np.ndarray:
 
     near, partner = cKDTree(points).query(points, k=min(LINE_NEIGHBORS, len(points)))
     rows = np.repeat(np.arange(len(points)), near.shape[1])
-    # The tree joins parts that no near neighbor does.
+    # The tree connects components that neighbors do not connect.
     tree = minimum_spanning_tree(cdist(points, points)).tocoo()
     both = (np.concatenate([rows, tree.row]), np.concatenate([partner.ravel(), tree.col]))
     lengths, index = np.concatenate([near.ravel(), tree.data]), np.sort(np.stack(both), axis=0)
@@ -76,15 +78,15 @@ def _from_an_end(points: np.ndarray) -> np.ndarray:
     def far(node: int) -> np.ndarray:
         return np.asarray(dijkstra(graph, directed=False, indices=node))
 
-    one = int(far(0).argmax())
-    other = int(far(one).argmax())
-    return far(min((one, other), key=lambda node: tuple(points[node])))
+    end = int(far(0).argmax())
+    opposite = int(far(end).argmax())
+    return far(min((end, opposite), key=lambda node: tuple(points[node])))
 
 
 def _spline(arc: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: int) -> np.ndarray:
-    """Points [LINE_SAMPLES, 3] of the cubic spline of equal pieces that is nearest to points [N, 3] with weights [N] at arcs [N].
+    """Points [LINE_SAMPLES, 3] of the cubic spline of equal pieces that fits points [N, 3] with weights [N] at arc lengths [N].
 
-    Its second differences are penalized a little (a P-spline), which decides where there are no points.
+    A small penalty of second differences (a P-spline) regularizes pieces without points.
     """
     from scipy.interpolate import BSpline
 
@@ -98,20 +100,20 @@ def _spline(arc: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: in
 
 
 def _projected(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Arc of the nearest point of a polyline for each point [N], beyond its ends too, and the distance from there [N], m."""
+    """Arc length of the nearest point of a polyline, extended beyond its ends, for each point [N], and its distance [N], m."""
     ends = 2 * line[[0, -1]] - line[[1, -2]]
     reach = len(line) // 8
     before, after = (line[[k]] + np.arange(1, reach + 1)[:, None] * (end - line[k]) for k, end in ((0, ends[0]), (-1, ends[1])))
     longer = np.concatenate([before[::-1], line, after])
     edge, place = bind(longer, np.zeros((len(longer) - 1, 3)), points)
-    lengths, part = pieces(longer), np.clip(place[:, 0], 0, 1)
-    arc = arc_of(lengths)[edge] + part * lengths[edge]
-    foot = longer[edge] + part[:, None] * np.diff(longer, axis=0)[edge]
+    lengths, fraction = pieces(longer), np.clip(place[:, 0], 0, 1)
+    arc = arc_of(lengths)[edge] + fraction * lengths[edge]
+    foot = longer[edge] + fraction[:, None] * np.diff(longer, axis=0)[edge]
     return arc - lengths[:reach].sum(), np.linalg.norm(points - foot, axis=1)
 
 
 def _equally_spaced(line: np.ndarray, arc: np.ndarray, count: int) -> np.ndarray:
-    """Points [count, 3] at equal arcs of a polyline, from the least to the largest arc of the nodes [N]."""
-    own = arc_of(pieces(line))
-    at = np.linspace(max(arc.min(), 0.0), min(arc.max(), own[-1]), count)
-    return np.stack([np.interp(at, own, column) for column in line.T], axis=1)
+    """Points [count, 3] at equal distances on a polyline, from the least to the largest arc length of the nodes [N]."""
+    along = arc_of(pieces(line))
+    at = np.linspace(max(arc.min(), 0.0), min(arc.max(), along[-1]), count)
+    return np.stack([np.interp(at, along, column) for column in line.T], axis=1)

@@ -1,4 +1,4 @@
-"""A recording of markers along a cable, [T, 3, n]: its form; and in space its length, the order of its markers, and gravity."""
+"""Checks of a recording of markers along a cable, [T, 3, n]: its form, length, order of markers, up axis and sampling rate."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from neuspring.extensions.rods.settings import Mocap
 from neuspring.intake.check import Layout
 
 MIN_MARKERS = 6
-"""Two controllers at either end and at least two observed markers."""
+"""Minimum number of markers: two controllers at each end and two observed markers."""
 MIN_FRAMES = 4
 MIN_DISTANCE = 1e-4
-"""Nodes must be farther apart than this, m; otherwise their spring would have no length."""
+"""Minimum distance of nodes, m; otherwise their spring would have no length."""
 SHORTEST, LONGEST = 0.05, 10.0
-"""m. Cables of another length are in another unit. Those of DEFORM are 0.91 to 1.07 m long."""
+"""Range of the length of a cable, m; other lengths indicate another unit. DEFORM's cables are 0.91 to 1.07 m long."""
 CABLE_UNITS = {"meters": 1.0, "millimeters": 0.001, "centimeters": 0.01, "inches": 0.0254}
 """Units of recordings, m."""
 DETOUR = 1.5
-"""Neighbors in the order of the file that are so many times as far apart as the longest step of the way over other markers are no
-neighbors along the cable. Those of DEFORM's cables are at most 1.3 times as far apart; where DEFT's branches follow each other, it
-is 4.6 times at least."""
+"""Maximum distance of neighbors in the file, in longest steps of the best path over other markers.
+
+Markers beyond are not neighbors along the cable. DEFORM's cables have at most 1.3; DEFT's branches have at least 4.6."""
 LEAST_SAG, HANGS = 0.05, 0.5
-"""Part of the cable's length by which it must sag to say where down is, and the cosine of the angle to what the settings call down.
-DEFORM's cables sag by 0.13 of their length at least, within 18 degrees (0.95) of down."""
+"""Minimum sag from which down is measured, as a fraction of the cable's length, and minimum cosine of its angle to down.
+
+DEFORM's cables sag by at least 0.13 of their length, within 18 degrees (0.95) of down."""
 SWINGS = 0.9
-"""Correlation of what turns a cable about the line of its ends and what gravity turns it with, from which the two are compared."""
+"""Minimum correlation of measured moments about the line of the ends and moments of gravity, from which their ratio is used."""
 TURNED = (0.5, 3.5)
-"""Range of their ratio. DEFORM's cables have 0.90 to 2.57: grips hold stiff ones back."""
+"""Range of this ratio. DEFORM's cables have 0.90 to 2.57, because grippers hold stiff cables back."""
 STANDARD_GRAVITY = 9.81
-"""m/s^2."""
+"""Gravity, m/s^2."""
 SPANS, LEAST_SPANS = (1, 2, 4, 8), 10
-"""Frames, before and after, over which accelerations are measured: the first that noise does not hide; and how many of these a
-recording needs."""
-CABLE_UNSEEN = "A cable needs a place of every marker in every sample: fill gaps, or cut the recording (mocap.start, mocap.frames)"
+"""Frames before and after over which accelerations are measured (the first that is above noise), and minimum length in spans."""
+CABLE_UNSEEN = "A cable needs every marker in every sample: fill gaps, or cut the recording (mocap.start, mocap.frames)"
 
 
 def turn(up: str) -> np.ndarray:
-    """The rotation [3, 3] from the axes of a file to a world with z up."""
+    """Rotation [3, 3] from the axes of a file to a world with +z up."""
     upward = np.eye(3)["xyz".index(up[1])] * (1 if up[0] == "+" else -1)
     side = np.eye(3)[1 if up[1] == "x" else 0]
     return np.array([side, np.cross(upward, side), upward])
 
 
 def in_space(raw: Any, settings: Mocap) -> np.ndarray:
-    """Positions [T, 3, n], m, z up, of a recording of the right form, by the unit and the up axis of the settings."""
+    """Positions [T, 3, n], m, with +z up, of a well-formed recording, by the unit and up axis of the settings."""
     data = np.asarray(raw)
     return np.asarray((settings.unit * turn(settings.up)).astype(data.dtype) @ data)
 
 
 def look(file: Path, raw: Any, settings: Mocap) -> list[Finding]:
-    """Every finding about a recording. Of one with an error no more is asked: without its form there is no length, and so on."""
+    """Every finding about a recording. Later checks are skipped after an error, because they depend on the earlier ones."""
     found = examine("cable", file, raw)
     if refused(found):
         return found
@@ -75,7 +75,7 @@ def look(file: Path, raw: Any, settings: Mocap) -> list[Finding]:
 
 
 def check_recording(file: Path, config: Config) -> list[Finding]:
-    """Every finding about the file of a recording; nothing is raised for bad content."""
+    """Every finding about the file of a recording. Bad content is a finding, not an exception."""
     try:
         return look(file, load_pickle(file), config.section(Mocap))
     except InputError as error:
@@ -86,10 +86,11 @@ RECORDINGS = Layout(recognizes=lambda path: path.suffix == ".pkl", check=check_r
 
 
 class Cable:
-    """Markers in space in the order of the file.
+    """Markers in space, in the order of the file.
 
-    `points` [T, n, 3], m, NaN where lost, are those before labels are exchanged, if they are; `apart` [n, n], m, their largest
-    distances: those that are not neighbors are far apart at some time; `along` [n], m, their places along the cable.
+    - `points` [T, n, 3], m: positions, NaN for lost markers, up to the first exchange of labels.
+    - `apart` [n, n], m: largest distances; markers that are not neighbors are far apart at some time.
+    - `along` [n], m: positions along the cable.
     """
 
     def __init__(self, moving: Moving, settings: Mocap) -> None:
@@ -99,24 +100,25 @@ class Cable:
         self.along = np.append(0.0, np.cumsum(np.diag(apart(self.points, np.nanmedian), 1)))
 
     def turned(self, span: int) -> tuple[float, float]:
-        """The ratio of what turns the inner markers about the line of the ends, by their accelerations over `span` frames before
-        and after, and of what gravity turns them with; and the correlation of the two over time. Forces at the ends turn nothing
-        about that line."""
-        places = self.points[span:-span]
-        second = (self.points[2 * span :] - 2 * places + self.points[: -2 * span]) * (self.settings.rate / span) ** 2
-        line = places[:, -1] - places[:, 0]
-        arms = (places - places[:, :1])[:, 2:-2] * np.gradient(self.along)[2:-2, None]
-        sums = np.cross(arms, second[:, 2:-2]).sum(axis=1), np.cross(arms.sum(axis=1), (0.0, 0.0, -STANDARD_GRAVITY))
-        moved, pulled = (np.einsum("tc,tc->t", one, line) / np.linalg.norm(line, axis=1) for one in sums)
-        # Single large accelerations are jumps.
+        """Ratio of the inner markers' moments about the line of the ends to those of gravity, and the correlation of both.
+
+        Accelerations over `span` frames before and after give the moments. Forces at the ends have no moment about this line.
+        """
+        points = self.points[span:-span]
+        second = (self.points[2 * span :] - 2 * points + self.points[: -2 * span]) * (self.settings.rate / span) ** 2
+        line = points[:, -1] - points[:, 0]
+        arms = (points - points[:, :1])[:, 2:-2] * np.gradient(self.along)[2:-2, None]
+        moments = np.cross(arms, second[:, 2:-2]).sum(axis=1), np.cross(arms.sum(axis=1), (0.0, 0.0, -STANDARD_GRAVITY))
+        moved, pulled = (np.einsum("tc,tc->t", moment, line) / np.linalg.norm(line, axis=1) for moment in moments)
+        # The largest accelerations are jumps.
         usual = np.abs(moved) <= np.quantile(np.abs(moved), 0.95)
         moved, pulled = moved[usual], pulled[usual]
-        both, square = float(moved @ pulled), max(float(pulled @ pulled), 1e-12)
-        return both / square, both / max(float(np.sqrt(square * (moved @ moved))), 1e-12)
+        product, square = float(moved @ pulled), max(float(pulled @ pulled), 1e-12)
+        return product / square, product / max(float(np.sqrt(square * (moved @ moved))), 1e-12)
 
 
 def malformed(raw: Any) -> dict[str, Any] | None:
-    """The first rule that the form breaks, and what was there."""
+    """The first rule of the form that the recording breaks, and the received value."""
     if not isinstance(raw, (np.ndarray, list, tuple)):
         return {"rule": "positions [T, 3, n] are required", "value": type(raw).__name__}
     try:
@@ -124,55 +126,56 @@ def malformed(raw: Any) -> dict[str, Any] | None:
     except ValueError:
         return {"rule": "positions [T, 3, n] are required", "value": "nested lists of different lengths"}
     if data.ndim != 3 or data.shape[1] != 3 or len(data) == 1:
-        form = ". Transposed by (0, 2, 1) they would be" if data.ndim == 3 and data.shape[2] == 3 else ""
+        form = ". Transpose it by (0, 2, 1)" if data.ndim == 3 and data.shape[2] == 3 else ""
         if data.ndim > 1 and data.size == 3 * data.shape[-1]:
-            form = ". Rows of all x, y and z, as of DEFT: reshape to (3, T, n), transpose by (1, 0, 2)"
+            form = ". For rows of x, y and z, as in DEFT, reshape to (3, T, n) and transpose by (1, 0, 2)"
         return {"rule": "the shape must be [T, 3, n]", "value": f"{data.shape}{form}"}
     if data.dtype.kind != "f":
         return {"rule": "the dtype must be floating point", "value": data.dtype}
     if data.shape[2] < MIN_MARKERS:
-        return {"rule": f"at least {MIN_MARKERS} markers are required (4 of them are controllers)", "value": data.shape[2]}
+        return {"rule": f"at least {MIN_MARKERS} markers are required (4 are controllers)", "value": data.shape[2]}
     if len(data) < MIN_FRAMES:
         return {"rule": f"at least {MIN_FRAMES} frames are required", "value": len(data)}
     if len(bad := np.argwhere(~np.isfinite(data))):
         t, _, marker = bad[0]
-        place = f"{data[tuple(bad[0])]} at frame {t}, marker {marker} ({len(bad)} in all)"
-        return {"rule": "every coordinate must be finite", "value": f"{place}. {CABLE_UNSEEN}", "frames": np.unique(bad[:, 0])}
+        first = f"{data[tuple(bad[0])]} at frame {t}, marker {marker} ({len(bad)} in total)"
+        return {"rule": "every coordinate must be finite", "value": f"{first}. {CABLE_UNSEEN}", "frames": np.unique(bad[:, 0])}
     return None
 
 
 def length(cable: Cable) -> dict[str, Any]:
-    """The length, m, and the unit by which it would be nearest to one meter."""
-    own = cable.along[-1]
-    name = min(CABLE_UNITS, key=lambda name: abs(np.log(CABLE_UNITS[name] * own / cable.settings.unit)))
-    return {"value": own, "unit": CABLE_UNITS[name], "name": name}
+    """The length, m, and the unit in which it would be nearest to one meter."""
+    total = cable.along[-1]
+    name = min(CABLE_UNITS, key=lambda name: abs(np.log(CABLE_UNITS[name] * total / cable.settings.unit)))
+    return {"value": total, "unit": CABLE_UNITS[name], "name": name}
 
 
 def too_near(cable: Cable) -> dict[str, Any] | None:
-    """The first marker of frame 0 that lies on its neighbor."""
+    """The first marker of frame 0 that is too near to its neighbor."""
     short = np.flatnonzero(pieces(cable.points[0]) < MIN_DISTANCE)
     return {"value": int(short[0]), "next": int(short[0]) + 1} if len(short) else None
 
 
 def disordered(cable: Cable) -> dict[str, Any]:
-    """The distance of neighbors in the file as a multiple of the longest step of the way over others; and the order in space."""
+    """Distance of neighbors in the file, in longest steps of the best path over other markers, and the order in space."""
     longest = cable.apart.copy()
     for over in range(len(longest)):
         longest = np.minimum(longest, np.maximum(longest[:, over, None], longest[over]))
     factors = np.diag(cable.apart, 1) / np.maximum(np.diag(longest, 1), MIN_DISTANCE)
-    links, told = spanned(cable.apart), {"value": float(factors.max()), "one": factors.argmax(), "two": factors.argmax() + 1}
+    links, words = spanned(cable.apart), {"value": float(factors.max()), "one": factors.argmax(), "two": factors.argmax() + 1}
     ends = np.bincount(links.ravel())
     if (branches := np.flatnonzero(ends > 2)).size:
-        form = f"their neighbors in space form branches at markers {listed(branches)}"
-        return told | {"next": f"{form}: a branched cable is not read. Give one branch, from end to end"}
+        form = f"The cable branches at markers {listed(branches)}"
+        return words | {"next": f"{form}: give one branch, from end to end"}
     order = depth_first_order(coo_array((links[:, 0], links.T), cable.apart.shape), int(ends.argmin()), directed=False)[0].tolist()
-    return told | {"next": f"along the cable they are in the order {order}: write data[:, :, {order}]"}
+    return words | {"next": f"Write the order along the cable: data[:, :, {order}]"}
 
 
 def ends(cable: Cable) -> Iterator[dict[str, Any]]:
-    """Frames in which the first or last three markers are not in their order: their outer two are not the farthest apart.
+    """Frames in which the outer two of the first or last three markers are not the farthest apart.
 
-    A gripper holds a cable straight there. In DEFORM's other recordings these are at least 1.05 times as far apart as neighbors.
+    A gripper holds the cable straight there. In DEFORM's correct recordings the outer two are at least 1.05 times as far apart as
+    neighbors.
     """
     for end, three in {"first": cable.points[:, :3], "last": cable.points[:, -3:]}.items():
         frames = np.linalg.norm(three - np.roll(three, 1, axis=1), axis=2).argmax(axis=1).nonzero()[0]
@@ -181,10 +184,10 @@ def ends(cable: Cable) -> Iterator[dict[str, Any]]:
 
 
 def hangs(cable: Cable) -> dict[str, Any] | None:
-    """The cosine of the angle between the way that the cable sags and down, and the axis of the file along which it sags."""
-    points, part = cable.points, (cable.along / cable.along[-1])[:, None]
-    # Mean place [3], m, of the inner markers from that on the line of the ends at their part of the length.
-    sag = (points - (1 - part) * points[:, :1] - part * points[:, -1:])[:, 2:-2].mean(axis=(0, 1))
+    """Cosine of the angle between the cable's sag and down, and the axis of the file along which it sags."""
+    points, fraction = cable.points, (cable.along / cable.along[-1])[:, None]
+    # Mean displacement [3], m, of the inner markers from the straight line between the ends.
+    sag = (points - (1 - fraction) * points[:, :1] - fraction * points[:, -1:])[:, 2:-2].mean(axis=(0, 1))
     deep = float(np.linalg.norm(sag))
     in_file = turn(cable.settings.up).T @ sag
     axis = int(np.abs(in_file).argmax())
@@ -194,9 +197,9 @@ def hangs(cable: Cable) -> dict[str, Any] | None:
 
 
 def swings(cable: Cable) -> dict[str, Any] | None:
-    """The ratio of what turns the cable and what gravity turns it with, and the rate at which it would be 1."""
+    """Ratio of the cable's measured moments to those of gravity, and the sampling rate at which it would be 1, Hz."""
     spans = [span for span in SPANS if len(cable.points) >= LEAST_SPANS * span]
-    ratio = next((ratio for ratio, alike in map(cable.turned, spans) if alike > SWINGS), None)
+    ratio = next((ratio for ratio, correlation in map(cable.turned, spans) if correlation > SWINGS), None)
     return {"value": ratio, "fits": float(f"{cable.settings.rate / np.sqrt(ratio):.2g}")} if ratio else None
 
 
@@ -205,18 +208,18 @@ checks = (
     Check("form of a recording", "cable", malformed, None, "error", "{rule}; received {value}", title=""),
     Check("length of the cable", "cable in space", length, (SHORTEST, LONGEST), "error",
           "a cable must be {low:g} to {high:g} m long; received {value:.4g} m, with mocap.unit {0.settings.unit:g} m. "
-          "Set mocap.unit: {unit:g}, if it is in {name}", title=""),
+          "If the file is in {name}, set mocap.unit: {unit:g}", title=""),
     Check("markers on one place", "cable in space", too_near, None, "error",
           f"neighboring markers must be {MIN_DISTANCE} m apart in frame 0; received markers {{value}} and {{next}}", title=""),
     Check("order along the cable", "cable in space", disordered, (0, DETOUR), "error",
-          "markers must be in their order along one cable; received markers {one} and {two} {value:.1f} times as far apart as the "
-          "longest step of the way over others; {next}", title=""),
+          "markers must be in their order along one cable; received markers {one} and {two}, {value:.1f} times as far apart as "
+          "the longest step of a path over other markers. {next}", title=""),
     Check("order at the ends", "cable in motion", ends, None, "warning", "markers at an end are not in their order along the cable",
-          "Exchange two columns there, or leave the frames out.", effect="a controller is in another's position"),
+          "Exchange two columns in these frames, or omit them.", effect="a controller has the position of another controller"),
     Check("up of the recording", "cable in motion", hangs, (HANGS, np.inf), "warning",
-          "a cable sags down; received one that sags by {cm:.0f} cm along {down}, with mocap.up {0.settings.up}. Set mocap.up: "
-          "'{up}'", title=""),
+          "a cable must sag down; received a sag of {cm:.0f} cm along {down}, with mocap.up {0.settings.up}. Set mocap.up: '{up}'",
+          title=""),
     Check("rate of the recording", "cable in motion", swings, TURNED, "warning",
-          "a cable should swing by gravity; received {value:.2f} times as much with mocap.rate {0.settings.rate:g} Hz. About "
-          "{fits:g} Hz would fit: set mocap.rate, or look at mocap.unit", title=""),
+          "a cable must swing by gravity; received {value:.2f} times this motion, with mocap.rate {0.settings.rate:g} Hz. Set "
+          "mocap.rate: {fits:g}, or check mocap.unit", title=""),
 )

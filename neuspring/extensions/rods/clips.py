@@ -1,4 +1,4 @@
-"""The numbers of a study of twins on other recordings of the same object, beside published numbers: DEFORM's benchmark."""
+"""A study of twins on other recordings of the same object, compared with published numbers: DEFORM's benchmark."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from neuspring.scores.paper import OwnStudy, Printed, Study, Values, printed, ro
 from neuspring.scores.table import DAMAGED, ScoreTable, collect, read_transfers
 
 EUCLID = "track_error"
-"""Markers of cables are nodes, so it is the mean Euclidean error of free markers."""
+"""Mean Euclidean error of free markers: markers of cables are nodes, so this is their track error."""
 LEARNING = ("search", "fit", "train")
-"""Stages whose time is that of the model."""
+"""Stages whose time counts as training time."""
 CLIP_COLUMNS = ["cable", "clip", "label", "method", "source", "seed", "l1_mm", "euclid_mm", "minutes"]
 CLIP_FACTS = ["l1_mm", "spread_mm", "median_mm", "worst_mm", "euclid_mm", "minutes", "worst_clip", "clips", "of", "seeds"]
 
 
 TAGS = {
-    "second-hand": "The paper printed the number. We read it second-hand, from a page that was made of the paper's TeX.",
-    "log": "The number stands in logs that DEFORM's authors published with their code.",
-    "others": "Others than DEFORM's authors trained DEFORM and published the number.",
-    "reference": "We measured it. It is no method: it shows what one gets without learning, or the least that is possible.",
+    "second-hand": "The paper prints the number. We read it on a web page that was made from the paper's TeX.",
+    "log": "The number is in logs that DEFORM's authors published with their code.",
+    "others": "Authors other than DEFORM's trained DEFORM and published the number.",
+    "reference": "We measured it. It is not a method, but the error without learning, or a lower limit.",
 }
-"""Meaning of the tag of a number in deform_published.csv."""
+"""Meaning of the tags in deform_published.csv."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedError(Printed):
-    """A published value."""
+    """A published value with its source."""
 
     source: str
     tag: str
-    """One of `TAGS`; empty: printed by the paper."""
+    """One of `TAGS`; empty: printed in the paper."""
 
 
 def published() -> Values:
-    """PublishedError errors on DEFORM's cables, mm, by label of the row, cable, metric."""
+    """Published errors on DEFORM's cables, mm, by label, cable and metric."""
     return {
         (row["method"], row["cable"], DEFORM_L1.name): PublishedError(
             **vars(printed(row["l1_mm"])), source=row["source"], tag=row["tag"]
@@ -62,14 +62,14 @@ def published() -> Values:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipNumbers(OwnStudy):
-    """The predictions of a study's methods on other recordings; each table is computed once."""
+    """Errors of a study's methods on other recordings. Each table is computed once."""
 
     published: ClassVar = {"deform_published": published}
     name: str
     study: Study
     results: Path
     sources: Sequence[str]
-    """Scenarios whose twins were rolled out on clips."""
+    """Scenarios whose twins predict clips."""
     methods: Sequence[str]
     """The methods of the benchmark."""
     seeds: Sequence[int]
@@ -80,15 +80,15 @@ class ClipNumbers(OwnStudy):
         return cls(name=name, study=study, results=results, sources=sources, methods=methods, seeds=seeds)
 
     def blocks(self) -> list[Any]:
-        """L1 per cable beside published numbers; ours in detail. Then the rows and runs that are not there, and why."""
+        """L1 per cable with published numbers, details of our methods, and the missing rows and runs with their reasons."""
         lines = [f"{label}: not run" for label in self.study.rows if label not in set(self.clips["label"])]
         failed = self.records[self.records["status"] != "ok"].itertuples()
         lines += [f"{run.label}, {run.scenario} / seed {run.seed}: {run.reason}" for run in failed]
-        last = [Items(title="Not in the tables, or not whole", items=lines)] if lines else []
+        last = [Items(title="Missing or incomplete", items=lines)] if lines else []
         return [_overview(self), *([_details(self)] if len(self.clips) else []), *last]
 
     def files(self, folder: Path) -> list[str]:
-        """Write the CSV files and the figure; Markdown lines that show them."""
+        """Write the CSV files and the figure; returns Markdown lines that show the figure."""
         for suffix, rows in {"": self.cells, "_clips": self.clips}.items():
             write_text(folder / f"{self.name}{suffix}.csv", rows.to_csv(index=False))
         path = folder / f"{self.name}_growth.png"
@@ -100,12 +100,12 @@ class ClipNumbers(OwnStudy):
 
     @property
     def labels(self) -> dict[str, str]:
-        """Method to label, of the methods that the benchmark has."""
+        """Method -> label, for the methods of the benchmark."""
         return {method: label for label, method in self.study.rows.items() if method in self.methods}
 
     @property
     def cables(self) -> list[str]:
-        """Those that we predicted, else those with published numbers."""
+        """Predicted cables; without any, cables with published numbers."""
         return list(dict.fromkeys(self.clips["cable"])) or list(dict.fromkeys(cable for _, cable, _ in self.study.values))
 
     @cached_property
@@ -114,7 +114,7 @@ class ClipNumbers(OwnStudy):
 
     @cached_property
     def clips(self) -> pd.DataFrame:
-        """Every clip, row, source and seed, mm; minutes of search and fit."""
+        """Errors of every clip, method, source and seed, mm, with minutes of search and fit."""
         if not len(table := self._read[0]):
             return pd.DataFrame(columns=CLIP_COLUMNS)
         keys = {"category": "cable", "scenario": "clip", "method": "method", "source": "source", "seed": "seed"}
@@ -129,7 +129,7 @@ class ClipNumbers(OwnStudy):
 
     @cached_property
     def records(self) -> pd.DataFrame:
-        """Every transfer that has a record: how it ended, clips that it was to be judged on, files that it kept, in the results."""
+        """Every transfer with a record: its status, its number of clips, and its file of frame errors in the results folder."""
         rows = []
         for run in self._read[1].to_dict("records"):
             path = self.results / run["scenario"] / run["method"] / str(run["seed"]) / "transfer.json"
@@ -141,10 +141,10 @@ class ClipNumbers(OwnStudy):
 
     @cached_property
     def cells(self) -> pd.DataFrame:
-        """A row per cable and row of the table, published numbers first; those have a `text`.
+        """One row per cable and row of the table; published numbers come first and have a `text`.
 
-        `l1_mm` is the mean over clips, seeds averaged within each; `spread_mm` the standard deviation over the seeds that have
-        every clip. `ranked`: it is a method, and has every clip that it was to be judged on, with every seed.
+        `l1_mm` is the mean over clips, after averaging seeds per clip. `spread_mm` is the standard deviation over seeds that have
+        every clip. `ranked`: the row is a method and has every clip with every seed.
         """
         asked = self.records.groupby("scenario")["targets"].max().to_dict()
         rows = []
@@ -177,22 +177,22 @@ class ClipNumbers(OwnStudy):
 
 
 TAG_SIGNS = {"second-hand": "†", "log": "‡", "others": "§", "reference": "¶", "": ""}
-"""Tag of a published number to the sign behind it."""
+"""Tag of a published number -> the sign after it."""
 
 
-def _overview(found: ClipNumbers) -> Table:
-    cells, counts = found.cells, found.clips.groupby("cable", sort=False)["clip"].nunique()
+def _overview(numbers: ClipNumbers) -> Table:
+    cells, counts = numbers.cells, numbers.clips.groupby("cable", sort=False)["clip"].nunique()
     best, rows = cells[cells["ranked"].astype(bool)].groupby("cable")["l1_mm"].min(), []
     for (label, source), part in cells.groupby(["label", "source"], sort=False):
         of = {cell.cable: cell for cell in part.itertuples()}
-        values = [_l1(of[cable], best) if cable in of else Cell(text=DASH) for cable in found.cables]
+        values = [_l1(of[cable], best) if cable in of else Cell(text=DASH) for cable in numbers.cables]
         rows.append([Cell(text=str(label)), Cell(text=str(source)), *values])
-    note = "mm: mean absolute error over clips, all markers (held ones count with 0), three coordinates and frames. "
+    note = "Mean absolute error, mm, over clips, all markers (held markers count with 0), three coordinates and frames. "
     clips = ", ".join(f"{cable} {count}" for cable, count in counts.items()) or "not run"
-    note += f"Ours: evaluation clips ({clips}), predicted open loop; ± standard deviation over seeds; * clips are missing. "
-    note += f"{found.study.training}. "
+    note += f"Ours: evaluation clips ({clips}), predicted open-loop; ± standard deviation over seeds; * clips are missing. "
+    note += f"{numbers.study.training}. "
     note += " ".join(f"{TAG_SIGNS[tag]} {text}" for tag, text in TAGS.items() if tag in set(cells["tag"]))
-    return Table(caption="L1 per cable", note=note.strip(), header=["Method", "Source", *found.cables], rows=rows, stub=2)
+    return Table(caption="L1 per cable", note=note.strip(), header=["Method", "Source", *numbers.cables], rows=rows, stub=2)
 
 
 def _l1(cell: Any, best: pd.Series) -> Cell:
@@ -201,23 +201,23 @@ def _l1(cell: Any, best: pd.Series) -> Cell:
     return Cell(text=text, mark="best" if cell.ranked and cell.l1_mm == best[cell.cable] else "", value=cell.l1_mm)
 
 
-def _details(found: ClipNumbers) -> Table:
+def _details(numbers: ClipNumbers) -> Table:
     rows = []
-    for cell in found.cells[found.cells["text"] == ""].itertuples():
-        numbers = [getattr(cell, name) for name in CLIP_FACTS[:6]]
-        texts = [DASH if np.isnan(value) else f"{value:.2f}" for value in numbers]
+    for cell in numbers.cells[numbers.cells["text"] == ""].itertuples():
+        values = [getattr(cell, name) for name in CLIP_FACTS[:6]]
+        texts = [DASH if np.isnan(value) else f"{value:.2f}" for value in values]
         texts += [str(cell.worst_clip), f"{cell.clips:.0f}/{cell.of:.0f}", f"{cell.seeds:.0f}"]
         rows.append([str(cell.cable), str(cell.label), *texts])
-    note = "L1 in mm: mean, median and worst over clips, seeds averaged within each. Euclidean: mean distance of free markers, mm. "
-    note += "Minutes: search and fit of one twin, mean over seeds; rows that share a search count it each."
+    note = "L1, mm: mean, median and worst over clips, after averaging seeds per clip. Euclidean: mean error of free markers, mm. "
+    note += "Minutes: search and fit of one twin, mean over seeds; each row includes a shared search."
     header = ["Cable", "Method", "Mean", "± seeds", "Median clip", "Worst clip", "Euclidean", "Minutes", "Worst", "Clips", "Seeds"]
     return replace(Table.of_texts(header, rows, "Ours in detail"), note=note, stub=2)
 
 
 def growth_figure(growth: pd.DataFrame, labels: Sequence[str]) -> Figure:
-    """Draw the mean error of free markers over time, a panel per cable, from rows cable, label, seconds, euclid_mm.
+    """Draw the mean error of free markers over time, one panel per cable, from rows cable, label, seconds, euclid_mm.
 
-    A row of the table has its color by its place in `labels`, whichever of them are there.
+    The index of a label in `labels` sets its color, independent of missing labels.
     """
     cables, shown = list(dict.fromkeys(growth["cable"])), [label for label in labels if label in set(growth["label"])]
     # A column of the legend is as wide as a panel.

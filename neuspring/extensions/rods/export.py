@@ -1,9 +1,10 @@
-"""A rod as a chain of rigid edges, and as MuJoCo's bodies. Its plugin for cables is gone, and knew one stiffness of the whole.
+"""A rod as a chain of rigid edges, in MuJoCo's bodies. MuJoCo 4 has no cable plugin, which also had one stiffness for all joints.
 
-The rest pose of the bodies is the unloaded shape (unloaded curvatures, no twist), the keyframe `start` is frame 0. A body's axes
-are t, m1, m2. Between two edges are three hinges, about t with stiffness GJ / l, about m1 and m2 with EI / l, each with the rod's
-damping times that. Edges keep their lengths, and their mass lies along them. A clamp is a mocap body that the end is welded to.
-Drag is left out. A rod that slips inside is refused: a branch is a spring behind a friction, and hinges have them side by side.
+- The rest pose is the unloaded shape (unloaded curvatures, no twist); the keyframe `start` is frame 0. A body's axes are t, m1,
+  m2.
+- Two edges have three hinges: about t with stiffness GJ / l, about m1 and m2 with EI / l. Each has the rod's damping times this.
+- Edges are rigid, with their mass along them. A clamp is a mocap body to which the end is welded. Drag is omitted.
+- Rods that slip inside raise InputError: a branch is a spring in series with friction, but hinges have both in parallel.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from neuspring.extensions.rods.nodes import frame_zero, radius_of
 from neuspring.extensions.rods.rod import Rod, rod_of
 
 CABLE_STEP = 2e-4
-"""s, at most: springs of joints are explicit there."""
+"""Maximum time step, s, because MuJoCo integrates the springs of joints explicitly."""
 THICKNESS = 0.002
-"""Least radius, m: nodes on the line show none."""
+"""Minimum radius, m, because nodes on the line give no radius."""
 WELD: dict[str, Any] = {"solref": f"{2 * CABLE_STEP} 1", "solimp": "0.999 0.9999 1e-4"}
 """A clamp is as stiff as the time step allows."""
 
@@ -31,12 +32,12 @@ HINGE_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 
 def text(*values: float | np.floating) -> str:
-    """Numbers as MJCF has them; float32 to the last bit."""
+    """Numbers for MJCF, which keep every bit of a float32."""
     return " ".join(f"{float(value):.9g}" for value in values)
 
 
 class to_mujoco:
-    """What the MuJoCo format asks of a body other than the lattice."""
+    """The rod for the format `mujoco` (`BODY_EXPORTS`)."""
 
     step = CABLE_STEP
 
@@ -45,7 +46,7 @@ class to_mujoco:
         self.radius = max(radius_of(self.rod), THICKNESS)
 
     def add(self, root: ET.Element, world: ET.Element, meets: dict[str, Any]) -> None:
-        """Add the chain edge0, edge1, ..., a site per node, clamps clamp0 and clamp1, and the keyframe `start` of frame 0."""
+        """Add the chain edge0, edge1, ..., one site per node, the clamps clamp0 and clamp1, and the keyframe `start`."""
         rod, radius = self.rod, self.radius
         edges = len(rod.lengths)
         mass, bend, twist, frames, rest, held = chain_of(rod)
@@ -77,10 +78,10 @@ class to_mujoco:
 
 
 class Chain(NamedTuple):
-    """A rod as rigid edges with springs of joints between them."""
+    """A rod as rigid edges with springs at the joints."""
 
     mass: np.ndarray
-    """Mass of each edge [E], kg: that of its vertices, which others share."""
+    """Mass of each edge [E], kg; adjacent edges share the mass of a vertex."""
     bend: np.ndarray
     """EI / l of each joint [E - 1], N m."""
     twist: np.ndarray
@@ -88,16 +89,16 @@ class Chain(NamedTuple):
     frames: Rotation
     """Axes t, m1, m2 of each edge in frame 0 [E]."""
     rest: Rotation
-    """Turn from each edge to the next without moments [E - 1]."""
+    """Rotation from each edge to the next without moments [E - 1]."""
     held: dict[int, int]
-    """End that is clamped, 0 or 1 -> its edge."""
+    """Clamped end, 0 or 1 -> its edge."""
 
 
 def chain_of(rod: Rod) -> Chain:
     """The edges and joints of a rod. Raises InputError if it slips inside."""
     if len(rod.slip):
-        rule = "the rod of another engine has no branches that slip inside"
-        raise InputError("--to", rule, f"{len(rod.slip)} (Rod.slip)", "Take --to npz, or fit a rod without: fit.rod.slip = 0.")
+        rule = "MuJoCo supports no branches that slip"
+        raise InputError("--to", rule, f"{len(rod.slip)} (Rod.slip)", "Use --to npz, or fit a rod with fit.rod.slip = 0.")
     edges = len(rod.lengths)
     share = rod.mass / np.where(np.isin(np.arange(edges + 1), (0, edges)), 1, 2)
     spans = rod.spans[1:-1]
@@ -115,7 +116,7 @@ def frames_of(rod: Rod) -> Rotation:
 
 
 def _rest(curvature: np.ndarray, by_angle: bool = False) -> Rotation:
-    """The turn from each edge to the next without moments, in the axes of either: about (0, -k2, k1) by 2 atan(|k| / 2), or |k|."""
+    """The rotation from each edge to the next without moments: about (0, -k2, k1) by 2 atan(|k| / 2), or by |k| (`by_angle`)."""
     k = np.stack([np.zeros(len(curvature) - 2), -curvature[1:-1, 1], curvature[1:-1, 0]], axis=1)
     size = np.linalg.norm(k, axis=1, keepdims=True)
     angle = size if by_angle else 2 * np.arctan(size / 2)

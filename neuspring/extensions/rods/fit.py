@@ -1,17 +1,18 @@
-"""Fit of a rod to whole recordings: Levenberg-Marquardt in everything that is unknown of a cable, through rising horizons.
+"""Fit of a rod to complete recordings: Levenberg-Marquardt in all unknowns of a cable, through increasing horizons.
 
-With errors e of all coordinates of tracked points in the frames of the horizon, and variables q with start 0 and scale s, it lowers
+Let e be the errors of all coordinates of tracked points in the frames of the horizon, and q variables with start 0 and scale s.
+The objective is
 
     mean(sqrt(e^2 + b^2) - b) + PRIOR sum((q / s)^2).
 
-With the weighted residuals r and their derivatives J, a step d solves (J'J + damping diag J'J) d = -J'r within bounds, for several
-dampings at once. The best step is taken if it lowers the objective, and the damping follows it.
-Derivatives are finite differences: a rollout per variable and recording, all of them lanes of one solver in double precision.
-Positive numbers are varied on logarithmic scales, and those along the arc as fields (`RodFit`) or joint by joint.
+With the weighted residuals r and their derivatives J, a step d solves (J'J + damping diag J'J) d = -J'r within bounds, for
+several dampings at once. The best step is accepted if it lowers the objective, and the damping follows it.
+Derivatives are finite differences: one rollout per variable and recording, in batch lanes of one solver in double precision.
+Positive numbers are varied on logarithmic scales; values along the arc are fields (`RodFit`) or free at each joint.
 
-Markers lie beside the center line of a cable, by 1 to 2 cm. How far (`Rod.offsets`, `Rod.clamps`) and the unloaded lengths are
-variables too: without them held ends are in a wrong place, and distances between markers change as the cable bends. Where vertices
-were laid out (`rod.lay_out`), these are the clamps' places and tilts, and place and mass of each marker.
+Markers are 1 to 2 cm beside the center line of a cable. These offsets (`Rod.offsets`, `Rod.clamps`) and the unloaded lengths are
+variables too: without them held ends are at wrong positions, and distances between markers change as the cable bends. With
+`rod.lay_out` the variables are the positions and tilts of clamps, and position and mass of each marker.
 """
 
 from __future__ import annotations
@@ -44,66 +45,66 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PRIOR = 1e-6
-"""Weight of the variables' squares, m: they decide where recordings say nothing."""
+"""Weight of the variables' squares, m. Regularizes variables that the data do not constrain."""
 SCALED_STEP = 5e-3
 """Step of the finite differences, in scales."""
 LARGEST_ERROR = 2.0
-"""Largest error of a coordinate that counts, m: what left the scene."""
+"""Maximum error of a coordinate, m; larger errors are clipped."""
 LEAST_GAIN = 2e-3
-"""A step that lowers the objective by less than this part of it is a stage's last."""
+"""Minimum relative gain of a step; a step below is the last of its stage."""
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
-"""Factors on the damping, for each step that is tried."""
+"""Factors on the damping that each step tries."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-6, 1e6
-"""Damping of a stage's first step, and its range. It grows while no step lowers the objective."""
+"""Initial damping of a stage, and its range. The damping grows while no step lowers the objective."""
 LAUNCHED = 16
-"""Frames kept of a launch."""
+"""Number of kept frames per launch."""
 STIFFNESS_TRIED = np.arange(-2.0, 9.0, 0.5)
-"""Logarithms of stiffness over that of the start which a search tries in frame 0 of a rod that was laid out."""
+"""Logarithms of stiffness over the initial stiffness; a search tries them in frame 0 of a rod with `lay_out`."""
 LANES = 512
-"""Rollouts that run in one solver at most."""
+"""Maximum number of rollouts in one solver."""
 VARIABLE_SCALES = {
     "bending": 1.0, "twisting": 1.0, "damping": 1.0, "drag": 1.0, "drag_quadratic": 1.0, "marker_mass": 1.0, "hands": 1.0,
     "dashpots": 1.0, "roll": 1.0, "curvature": 0.3, "bending_along": 0.5, "twisting_along": 0.5, "clamps": 0.02, "offsets": 0.01,
     "stretch": 0.01, "tilts": 0.05, "places": 0.01, "slip_share": 1.0, "slip_yield": 0.7, "slip_twist": 0.5,
 }  # fmt: skip
-"""Scale of each kind of variable: of logarithms, rad, curvatures (1), and m."""
+"""Scale of each kind of variable: logarithms, rad, curvatures (1) and m."""
 LOGARITHMIC = (
     "bending", "twisting", "damping", "drag", "drag_quadratic", "marker_mass", "hands", "dashpots", "slip_share", "slip_yield",
     "slip_twist",
 )  # fmt: skip
 SLIP_SHARE, SLIP_ANGLES = 0.3, (0.02, 3.0)
-"""Share of each branch that slips where a fit begins, and turns of the whole rod at which the first and the last does, rad."""
+"""Initial share of each branch that slips, and bends of the rod at which the first and the last branch slip, rad."""
 SLIP_DAMPING = 0.02
-"""Inner damping there, at most, s: friction takes its place."""
+"""Maximum initial inner damping with such branches, s, because friction replaces it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RodSteps(RodFit):
-    """The settings with the course of the fit."""
+    """The settings, and constants of the optimization."""
 
     markers: bool = True
-    """Fit of how far markers lie beside the center line, and the lengths between them."""
+    """Fit the offsets of markers from the center line, and the lengths between markers."""
     rounds: int = 8
-    """Steps per stage, at most; a stage ends where a step gains less than 0.2 %."""
+    """Maximum number of steps per stage."""
     robust: float = 0.02
-    """Robustness b, m: errors e count as sqrt(e^2 + b^2), so that recordings that flip do not decide."""
+    """Robustness b, m. Errors e count as sqrt(e^2 + b^2), which limits the influence of recordings that flip."""
 
 
 @dataclass(frozen=True)
 class Variables:
-    """Variables of a twin, as one vector q [Q], 0 at the start."""
+    """Variables of a twin, as one vector q [Q], initially 0."""
 
     twin: Twin
     tracked: int
     sizes: dict[str, int]
     stiffness_along: np.ndarray
-    """Basis [V, n] of log EI and log GJ along the arc."""
+    """Basis of log EI and log GJ along the arc [V, n]."""
     curvature_along: np.ndarray
-    """Basis [V, n] of k1 and k2 over the joint's length, along the arc."""
+    """Basis of k1 and k2 per joint along the arc [V, n]."""
 
     @classmethod
     def of(cls, twin: Twin, settings: RodSteps, tracked: int = 0) -> Variables:
-        """The variables of a fit. So many first nodes are tracked points."""
+        """The variables of a fit. The first `tracked` nodes are tracked points."""
         rod, held = rod_of(twin), rod_of(twin).held >= 0
         if settings.slip and not len(rod.slip):
             yields = np.geomspace(*SLIP_ANGLES, settings.slip) / rod.lengths.sum()
@@ -113,7 +114,7 @@ class Variables:
         along = _basis(rod, {"constant": "straight"}.get(settings.stiffness, settings.stiffness), settings.knots)
         bent = _basis(rod, settings.curvature, settings.knots)
         if settings.curvature != "free":
-            # A field of the curvature per length.
+            # The field is the curvature per length.
             bent = bent * (rod.spans / rod.spans[1:-1].mean())[:, None]
         ends = int(held[:2].all()) + int(held[-2:].all())
         sizes = dict.fromkeys(("bending", "twisting", "damping", "drag", "drag_quadratic"), 1)
@@ -138,7 +139,7 @@ class Variables:
         return np.array([VARIABLE_SCALES[name] for name in self.kinds])
 
     def part(self, q: np.ndarray, name: str) -> np.ndarray:
-        """The variables of one kind; zeros where they are not varied."""
+        """The variables of one kind; zero if this kind is not varied."""
         parts = np.split(q, np.cumsum(list(self.sizes.values())))
         return dict(zip(self.sizes, parts, strict=False)).get(name, np.zeros(1))
 
@@ -167,7 +168,7 @@ class Variables:
             tilts = start.tilts.copy()
             tilts[clamped] += self.part(q, "tilts").reshape(-1, 2)
             changes |= {"tilts": tilts} | self._relaid(q, clamps - start.clamps)
-            # Curvatures per length stay.
+            # Curvatures per length do not change.
             stretch = changes["lengths"][0] / start.lengths[0]
             changes["curvature"] = stretch * changes.get("curvature", start.curvature)
         lengths = changes.get("lengths", start.lengths).copy()
@@ -178,12 +179,12 @@ class Variables:
             offsets[free] += self.part(q, "offsets").reshape(-1, 2)
             changes |= {"lengths": lengths, "offsets": offsets}
         if "marker_mass" in self.sizes:
-            before, own = (np.convolve(each, [0.5, 0.5]) for each in (start.lengths, lengths))
+            before, cable = (np.convolve(edges, [0.5, 0.5]) for edges in (start.lengths, lengths))
             markers = (start.mass - before) * factor["marker_mass"][0]
             if start.laid:
                 masses = np.linalg.lstsq(made.marker_shares(start, self.tracked), start.mass - before)[0]
                 markers = made.marker_shares(replace(start, **changes), self.tracked) @ (masses * factor["marker_mass"])
-            changes["mass"] = own + markers
+            changes["mass"] = cable + markers
         material = replace(twin.material, drag=twin.material.drag * float(factor["drag"][0]))
         if "hands" in self.sizes:
             material = replace(
@@ -192,21 +193,22 @@ class Variables:
         return replace(twin, material=material, body=replace(start, **changes))
 
     def _relaid(self, q: np.ndarray, moved: np.ndarray) -> dict[str, np.ndarray]:
-        """Lengths and places of nodes of a rod that was laid out, where its clamps go by `moved` [2, 3] along and beside it, m.
+        """Lengths and node positions of a rod with `lay_out` whose clamps move by `moved` [2, 3], m, along and beside the line.
 
-        What is between clamps stays where it is on the unloaded line; tracked points go along and beside it by their variables.
+        Nodes between clamps keep their positions on the unloaded line; tracked points move along and beside it by their
+        variables.
         """
         start = rod_of(self.twin)
         low, high = free_part(start)
         ratio = 1 + (moved[1, 0] - moved[0, 0]) / (high - low)
         lengths = start.lengths * ratio
         place = start.place.copy()
-        # Distance from the middle of the first edge.
+        # Distances from the middle of the first edge.
         at = arc_of(start.lengths)[start.edge] + place[:, 0] * start.lengths[start.edge]
         at = at - start.lengths[0] / 2 + lengths[0] / 2 - moved[0, 0]
-        by = self.part(q, "places").reshape(-1, 3)
-        at[: len(by)] += by[:, 0]
-        place[: len(by), 1:] += by[:, 1:]
+        shifts = self.part(q, "places").reshape(-1, 3)
+        at[: len(shifts)] += shifts[:, 0]
+        place[: len(shifts), 1:] += shifts[:, 1:]
         arc = arc_of(lengths)
         edge = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(lengths) - 1)
         place[:, 0] = (at - arc[edge]) / lengths[edge]
@@ -214,9 +216,9 @@ class Variables:
 
 
 def free_part(rod: Rod) -> tuple[float, float]:
-    """Distances from the first vertex, m, between which fields along the arc have their knots.
+    """Range of the knots of fields along the arc: distances from the first vertex, m.
 
-    They are those of the joints at the ends, or the ends of what bends where vertices were laid out, whose number is arbitrary.
+    It is the range of the joints. With `lay_out`, whose number of vertices is arbitrary, it is the range that bends.
     """
     arc = arc_of(rod.lengths)
     if not rod.laid:
@@ -225,7 +227,7 @@ def free_part(rod: Rod) -> tuple[float, float]:
 
 
 def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
-    """Functions along the arc at the vertices [V, n]: none (straight), one per inner joint, or cubic splines between knots."""
+    """Functions along the arc at the vertices [V, n]: none (straight), one constant, one per inner joint, or cubic splines."""
     count = len(rod.mass)
     if kind == "straight":
         return np.zeros((count, 0))
@@ -241,47 +243,47 @@ def _basis(rod: Rod, kind: str, knots: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Tracked points and hands of C recordings of one body, padded to as many frames."""
+    """Tracked points and controllers of C recordings of one object, padded to the same number of frames."""
 
     observations: tuple[Observations, ...]
     hands: torch.Tensor
-    """Way points [T, C, hands, 3 or 4] (controllers.py)."""
+    """Waypoints of the controllers [T, C, hands, 3 or 4] (controllers.py)."""
     points: np.ndarray
     """Tracked points [C, T, No, 3], m."""
     counts: np.ndarray
-    """True where a point is seen in a training frame [C, T, No]."""
+    """Whether a point is visible in a training frame [C, T, No]."""
     velocities: tuple[np.ndarray, ...]
     """Velocities of tracked points or of all nodes in frame 0, m/s."""
 
     @classmethod
     def of(cls, observations: Sequence[Observations], twin: Twin, oracle: bool = False) -> Recordings:
-        """Recordings with as many tracked points and hands each; frames before the split, or all for an oracle."""
-        frames = [frames_seen(each, oracle=oracle) for each in observations]
+        """Recordings with equally many tracked points and controllers; training frames, or all frames for an oracle."""
+        frames = [frames_seen(recording, oracle=oracle) for recording in observations]
         rows = [np.minimum(np.arange(max(frames)), end - 1) for end in frames]
         pairs = list(zip(observations, rows, strict=True))
         inside = [np.arange(max(frames)) < end for end in frames]
-        counts = [each.object_visibility[index] & known[:, None] for (each, index), known in zip(pairs, inside, strict=True)]
+        counts = [seen.object_visibility[index] & known[:, None] for (seen, index), known in zip(pairs, inside, strict=True)]
         return cls(
             tuple(observations),
             _paths(pairs),
-            np.stack([each.object_points[index] for each, index in pairs]).astype(np.float64),
+            np.stack([recording.object_points[index] for recording, index in pairs]).astype(np.float64),
             np.stack(counts),
-            tuple(initial_velocity(each, twin.simulation.initial_velocity) for each in observations),
+            tuple(initial_velocity(recording, twin.simulation.initial_velocity) for recording in observations),
         )
 
     def bodies(self, twins: Sequence[Twin]) -> list[Twin]:
-        """Each twin in frame 0 of each recording. Of a cable that clamps hold, tracked points are the only nodes."""
-        pairs = [(twin, each) for twin in twins for each in self.observations]
+        """Each twin in frame 0 of each recording. A cable that clamps hold has only tracked points as nodes."""
+        pairs = [(twin, recording) for twin in twins for recording in self.observations]
         if len(twins[0].topology.springs):
-            return [made.on_recording(twin, each) for twin, each in pairs]
+            return [made.on_recording(twin, recording) for twin, recording in pairs]
         if rod_of(twins[0]).laid:
-            return made.hung([made.of_first(twin, self.points.shape[2]) for twin, _ in pairs], [each for _, each in pairs])
-        moved = [made.of_markers(twin, each) for twin, each in pairs]
+            return made.hung([made.of_first(twin, self.points.shape[2]) for twin, _ in pairs], [seen for _, seen in pairs])
+        moved = [made.of_markers(twin, recording) for twin, recording in pairs]
         vertices = settled([rod_of(twin) for twin in moved], np.stack([rod_of(twin).vertices for twin in moved]))
         return [replace(twin, body=replace(rod_of(twin), vertices=x)) for twin, x in zip(moved, vertices, strict=True)]
 
     def predicted(self, twins: Sequence[Twin], frames: int, every: int, device: str) -> np.ndarray:
-        """Tracked points [K, C, frames kept, No, 3], m, of K twins: frames 1, 1 + every, ... below `frames`."""
+        """Predicted tracked points of K twins [K, C, kept frames, No, 3], m: frames 1, 1 + every, ... below `frames`."""
         count, tracked = len(self.observations), self.points.shape[2]
         bodies = self.bodies(twins)
         solver = RodFrames(bodies, device)
@@ -295,22 +297,22 @@ class Recordings:
             rows = hands[first - 1 : min(first + size, frames)]
             # Frames 1, 1 + every, ...
             kept.append(solver.advance(rows, slice((1 - first) % every, None, every))[:, :, :tracked].cpu())
-        found = torch.cat(kept).transpose(0, 1).reshape(len(twins), count, -1, tracked, 3).numpy()
-        return np.asarray(np.nan_to_num(found, nan=LARGEST_ERROR * 10))
+        predicted = torch.cat(kept).transpose(0, 1).reshape(len(twins), count, -1, tracked, 3).numpy()
+        return np.asarray(np.nan_to_num(predicted, nan=LARGEST_ERROR * 10))
 
 
 def _paths(pairs: Sequence[tuple[Observations, np.ndarray]]) -> torch.Tensor:
-    """Way points of the hands of recordings, in these frames of each [T, C, hands, 3 or 4]: 4 where some do not always hold."""
+    """Waypoints of controllers in these frames of recordings [T, C, hands, 3 or 4]; 4 if some do not always hold."""
     parts = []
-    for each, rows in pairs:
-        valid = each.controller_valid[rows] if each.controller_valid.size else None
-        parts.append(waypoints(torch.tensor(each.controller_points[rows]), valid))
+    for recording, rows in pairs:
+        valid = recording.controller_valid[rows] if recording.controller_valid.size else None
+        parts.append(waypoints(torch.tensor(recording.controller_points[rows]), valid))
     width = max(part.shape[-1] for part in parts)
     return torch.stack([torch.cat([part, torch.ones_like(part[..., : width - part.shape[-1]])], dim=-1) for part in parts], dim=1)
 
 
 class Levenberg:
-    """Lowers the objective of some variables on some recordings."""
+    """Levenberg-Marquardt for the variables of a rod on recordings."""
 
     def __init__(self, recordings: Recordings, settings: RodSteps, device: str = "cpu", threads: int = 1) -> None:
         self.recordings, self.settings, self.device = recordings, settings, device
@@ -318,19 +320,19 @@ class Levenberg:
         self.rollouts = 0
 
     def errors(self, variables: Variables, qs: Sequence[np.ndarray], frames: int, every: int) -> np.ndarray:
-        """Errors [K, R], m, of K candidates in all coordinates that count."""
+        """Errors of K candidates in all compared coordinates [K, R], m."""
         recordings, kept = self.recordings, slice(1, frames, every)
         size = max(LANES // len(recordings.observations), 1)
         parts = np.array_split(np.arange(len(qs)), max(-(-len(qs) // size), min(self.threads, len(qs))))
 
-        def one(part: np.ndarray) -> np.ndarray:
-            found = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
-            apart = np.clip(found - recordings.points[None, :, kept], -LARGEST_ERROR, LARGEST_ERROR)
+        def of_part(part: np.ndarray) -> np.ndarray:
+            predicted = recordings.predicted([variables.made(qs[k]) for k in part], frames, every, self.device)
+            apart = np.clip(predicted - recordings.points[None, :, kept], -LARGEST_ERROR, LARGEST_ERROR)
             return np.asarray(apart[:, recordings.counts[:, kept]].reshape(len(part), -1))
 
         self.rollouts += len(qs) * len(recordings.observations)
         with ThreadPoolExecutor(max(self.threads, 1)) as pool:
-            return np.concatenate(list((pool.map if self.threads > 1 else map)(one, parts)))
+            return np.concatenate(list((pool.map if self.threads > 1 else map)(of_part, parts)))
 
     def objective(self, errors: np.ndarray, q: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """The objective of candidates, m, from errors [K, R] and variables [K, Q]."""
@@ -338,7 +340,7 @@ class Levenberg:
         return np.asarray(np.mean(np.sqrt(errors**2 + b**2) - b, axis=-1) + PRIOR * ((q / scale) ** 2).sum(axis=-1))
 
     def lowered(self, twin: Twin, progress: Progress) -> tuple[Twin, float, list[dict[str, Any]]]:
-        """The twin after the stages of the settings, the objective of the last one, m, and a row per step."""
+        """The twin after all stages, the objective of the last stage, m, and one row per step."""
         variables, history = Variables.of(twin, self.settings, self.recordings.points.shape[2]), list[dict[str, Any]]()
         q, end = np.zeros(len(variables.scale)), self.recordings.points.shape[1]
         for horizon in self.settings.horizons:
@@ -353,7 +355,7 @@ class Levenberg:
         return variables.made(q), float(self.objective(last, q, variables.scale)[0]), history
 
     def stage(self, variables: Variables, q: np.ndarray, frames: int, report: Callable[[dict[str, float]], None]) -> np.ndarray:
-        """Steps on the first frames, from q. `report` gets a row after each."""
+        """Steps on the first frames, starting from q. `report` gets one row per step."""
         every = self.settings.every
         if frames <= 30 * every:
             every = max(every // 2, 1)
@@ -362,7 +364,7 @@ class Levenberg:
         value = float(self.objective(errors, q, scale))
         damping = FIRST_DAMPING
         for _ in range(self.settings.rounds):
-            # In the units of their scales, so that bounds and damping mean the same for all.
+            # Derivatives in units of the scales, so that bounds and damping mean the same for all variables.
             slopes = (self.errors(variables, list(q + np.diag(SCALED_STEP * scale)), frames, every) - errors) / SCALED_STEP
             weights = 1 / np.sqrt(errors**2 + b**2) / len(errors)
             products = (slopes * weights) @ slopes.T + 2 * PRIOR * np.eye(len(q))
@@ -370,14 +372,14 @@ class Levenberg:
             best, before = None, value
             while best is None and damping <= MOST_DAMPING:
                 tried = [q + scale * damped_step(products, gradient, damping * factor) for factor in DAMPINGS]
-                found = self.errors(variables, tried, frames, every)
-                costs = self.objective(found, np.array(tried), scale)
+                candidates = self.errors(variables, tried, frames, every)
+                costs = self.objective(candidates, np.array(tried), scale)
                 best = int(np.argmin(costs))
                 if not costs[best] < value:
                     best, damping = None, damping * (DAMPINGS[-1] * 10)
             if best is None:
                 break
-            q, value, errors = tried[best], float(costs[best]), found[best]
+            q, value, errors = tried[best], float(costs[best]), candidates[best]
             damping = max(damping * DAMPINGS[best], LEAST_DAMPING)
             norm = float(np.linalg.norm(gradient))
             report({"loss": float(3 * np.mean(errors**2)), "gradient_norm": norm, "learning_rate": damping})
@@ -387,9 +389,9 @@ class Levenberg:
 
 
 def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
-    """d that solves (A + damping diag A) d = -g for A [V, V], g [V], and -1 <= d <= 1; what leaves is held at its bound."""
+    """Solve (A + damping diag A) d = -g for A [V, V], g [V] with -1 <= d <= 1; variables beyond a bound are fixed there."""
     scale = np.diag(products)
-    # A variable without effect stays where it is.
+    # Variables without effect do not move.
     matrix = products + damping * np.diag(np.maximum(scale, 1e-12 * scale.max()))
     step, free = np.zeros(len(gradient)), scale > 1e-12 * scale.max()
     while free.any():
@@ -398,7 +400,7 @@ def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float) -> n
         beyond = np.where(free, np.abs(step) - 1, 0.0)
         if beyond.max() <= 0:
             break
-        # One at a time: where it is held, others may not leave any more.
+        # Fixes one variable at a time, because others may then stay within their bounds.
         worst = int(np.argmax(beyond))
         step[worst] = np.clip(step[worst], -1, 1)
         free[worst] = False
@@ -407,12 +409,12 @@ def damped_step(products: np.ndarray, gradient: np.ndarray, damping: float) -> n
 
 @dataclass(frozen=True, kw_only=True)
 class RodResult(Learned):
-    """The best rod, and how it was found."""
+    """The best rod and the history of its search or fit."""
 
     value: float
-    """The objective at the end, m."""
+    """The final objective, m."""
     history: pd.DataFrame
-    """A row per step: stage, loss (mean squared error of the horizon's frames, m^2), gradient_norm, learning_rate (the damping)."""
+    """One row per step: stage, loss (mean squared error in the horizon, m^2), gradient_norm, learning_rate (the damping)."""
 
 
 def search_rod(
@@ -424,7 +426,7 @@ def search_rod(
     threads: int = 1,
     record: Path | None = None,
 ) -> RodResult:
-    """The constants of a rod, on the frames of the first horizon; a row per step goes to the file `record`."""
+    """Search the constants of a rod on the frames of the first horizon; the file `record` gets one row per step."""
     import pandas as pd
 
     require_pool(observations, pool)
@@ -432,22 +434,22 @@ def search_rod(
     first = RodSteps(**vars(settings.fit.section(RodFit)))
     first = replace(first, stiffness="constant", curvature="constant", markers=False, slip=0)
     first = replace(first, horizons=first.horizons[:1])
-    axis = axis_for([made.line_of(each) for each in recordings if each.line.size])
+    axis = axis_for([made.line_of(recording) for recording in recordings if recording.line.size])
     start = made.rod_twin(observations, settings, axis)
     solver = Levenberg(Recordings.of(recordings, start), first, device, threads)
     if rod_of(start).laid:
-        # What hangs in frame 0 says how stiff it is.
+        # The rod hangs in frame 0, so its shape indicates its stiffness.
         variables = Variables.of(start, first, observations.object_points.shape[1])
         tried = [factor * (variables.kinds == "bending") + factor * (variables.kinds == "twisting") for factor in STIFFNESS_TRIED]
         values = solver.objective(solver.errors(variables, tried, 2, 1), np.array(tried), variables.scale)
         start = variables.made(tried[int(values.argmin())])
     twin, value, history = solver.lowered(start, Progress(f"search {observations.scenario.name}, rod", first.rounds))
-    found = _result(twin, value, history)
+    result = _result(twin, value, history)
     if record is not None:
-        write_table(found.history, record)
-    costs = found.history["loss"]
-    facts = {"cost": value, "rollouts": solver.rollouts, "collision_overflow": 0, **found.facts, **twin.counts}
-    return replace(found, course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}), facts=facts)
+        write_table(result.history, record)
+    costs = result.history["loss"]
+    facts = {"cost": value, "rollouts": solver.rollouts, "collision_overflow": 0, **result.facts, **twin.counts}
+    return replace(result, course=pd.DataFrame({"cost": costs, "best_cost": costs.cummin()}), facts=facts)
 
 
 def fit_rod(
@@ -460,32 +462,32 @@ def fit_rod(
     device: str = "cpu",
     threads: int = 1,
 ) -> RodResult:
-    """All variables of a rod, stage by stage, from the twin of its search. Raises InputError, NumericalFailure."""
+    """Fit all variables of a rod in stages, starting from the twin of its search. Raises InputError, NumericalFailure."""
     require_pool(observations, pool)
     recordings, settings = Recordings.of([observations, *pool], twin, oracle), RodSteps(**vars(settings))
     solver = Levenberg(recordings, settings, device, threads)
     progress = Progress(f"fit {observations.scenario.name}, rod", settings.rounds * len(settings.horizons))
     twin, value, history = solver.lowered(twin, progress)
-    # Where markers lie beside the line, frame 0 has another line now.
+    # New offsets of markers change the line of frame 0.
     twin = made.on_recording(twin, observations)
-    found = _result(twin, value, history)
+    result = _result(twin, value, history)
     counted = {"best_loss": value, "steps": len(history), "rollouts": solver.rollouts, "collision_overflow": 0}
-    return replace(found, facts=counted | found.facts | twin.counts)
+    return replace(result, facts=counted | result.facts | twin.counts)
 
 
 def require_pool(here: Observations, pool: Sequence[Observations]) -> None:
-    """Raise InputError unless recordings have one center line: as many tracked points, hands and vertices."""
+    """Raise InputError unless recordings have one center line: equally many tracked points, controllers and vertices."""
     if pool and not here.line.size:
-        rule = "recordings of a pool must have markers along the line, for a rod"
-        raise InputError(f"pool of {here.scenario.name}", rule, "none", "Choose row rod_single.")
+        rule = "for a rod, recordings of a pool must have markers along the line"
+        raise InputError(f"pool of {here.scenario.name}", rule, "none", "Use method rod_single.")
     counted = "tracked points, controllers and vertices"
     require_alike(
-        [here, *pool], counted, lambda each: (each.object_points.shape[1], each.controller_points.shape[1], len(each.line))
+        [here, *pool], counted, lambda seen: (seen.object_points.shape[1], seen.controller_points.shape[1], len(seen.line))
     )
 
 
 def axis_for(lines: Sequence[np.ndarray]) -> np.ndarray:
-    """`Rod.axis` [3] for lines [V, 3] in frame 0: y, or x where the end of one lies along y."""
+    """`Rod.axis` [3] for lines [V, 3] in frame 0: y, or x if an end of a line is along y."""
     ends = np.concatenate([np.diff(line, axis=0)[[0, -1]] for line in lines] or [np.eye(3)[:1]])
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)
     axis: np.ndarray = np.eye(3)[1 if np.abs(ends[:, 1]).max() <= PARALLEL else 0]
@@ -496,7 +498,7 @@ def _result(twin: Twin, value: float, history: list[dict[str, Any]]) -> RodResul
     import pandas as pd
 
     if not history or not np.isfinite(value):
-        raise NumericalFailure(f"no step lowers the error of the rod from its start ({value:.3g} m)")
+        raise NumericalFailure(f"no step lowers the initial error of the rod ({value:.3g} m)")
     rod = rod_of(twin)
     inner = slice(1, -1)
     facts = {name: float(np.median(getattr(rod, name)[inner])) for name in ("bending", "twisting", "mass")}

@@ -8,14 +8,14 @@ from neuspring.core.artifacts import Observations
 from neuspring.scores.metrics import Metric
 
 LOWEST = 0.002001
-"""Height, m, below which DEFORM's evaluation lifts observed markers."""
+"""Minimum height of observed markers in DEFORM's evaluation, m."""
 
 
 def deform_l1(positions: np.ndarray, observations: Observations) -> np.ndarray:
-    """Mean absolute difference per frame [F], m, over the markers of the line and coordinates, of positions [F, N, 3].
+    """Mean absolute difference of positions [F, N, 3] per frame [F], m, over coordinates and markers of the line.
 
-    As DEFORM's evaluation has it: held markers count with 0, and observed ones are at least `LOWEST` high. The line must consist of
-    tracked points, which are visible always, and controllers.
+    As in DEFORM's evaluation, held markers count with 0, and observed markers have at least the height `LOWEST`. The line must
+    consist of controllers and of tracked points that are always visible.
     """
     free = observations.line[observations.line < len(observations.nodes)]
     seen = observations.object_points[: len(positions), free].astype(np.float64)
@@ -25,7 +25,7 @@ def deform_l1(positions: np.ndarray, observations: Observations) -> np.ndarray:
 
 
 def _of_cables(positions: np.ndarray, observations: Observations) -> np.ndarray | None:
-    """DEFORM's error; None but for a line of markers alone."""
+    """DEFORM's error; None unless the line has only markers, all visible."""
     line = observations.line
     of_markers = not ((line >= observations.object_points.shape[1]) & (line < len(observations.nodes))).any()
     of_markers &= bool(line.size) and observations.scenario.up == "+z" and bool(observations.object_visibility.all())
@@ -41,5 +41,5 @@ DEFORM_L1 = Metric(
     factor=1e3,
     digits=2,
     function=_of_cables,
-    explained="mean absolute difference of all coordinates of the markers along a cable, held ones (0) included",
+    explained="mean absolute difference of all coordinates of the markers along a cable, including held markers (0)",
 )

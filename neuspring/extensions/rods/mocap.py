@@ -1,22 +1,21 @@
 """Motion capture of cables (DLO data of DEFORM, arXiv 2406.05931) -> Observations.
 
-One pickle is one recording: positions [T, 3, n], float64; released as nested lists in meters, 100 Hz, z up. Arrays are accepted
-too, and `mocap.unit`, `mocap.rate` and `mocap.up` name another unit, rate and axis.
-Markers run along the cable. Robots hold the two at either end: they are the controllers, each with a ring of points around
-it. The others are observed. There is no surface, so the body is sampled as rings around a smooth centerline through
-the markers of frame 0.
+One pickle is one recording: positions [T, 3, n], float64, as nested lists or as an array. DEFORM's data are in meters, at 100 Hz,
+with z up; `mocap.unit`, `mocap.rate` and `mocap.up` set other values. Markers are in order along the cable. Robots hold two
+markers at each end: these are the controllers, each with a ring of points around it. The other markers are observed. The data
+have no surface, so nodes are rings around a smooth center line through the markers of frame 0.
 
-Points on one line leave the roll about it free. A gripper does not, so each held marker m gets a ring of points
+Points on one line leave the roll about it free, but a gripper does not. So each held marker m gets a ring of points
 
     m(t) + r (cos a_k n(t) + sin a_k d(t) x n(t)),    a_k = 2 pi (k + 1/2) / count.
 
-d(t) is the unit direction of the end's two markers. n(t) is normal to it and parallel-transported: from frame to frame the smallest
-rotation that turns d carries n along, so the ring follows every turn of the end and never spins about it. A spin that the gripper
-did make is not in the data. Half a step of the angle keeps the points away from the body's own ring around the first and the last
+d(t) is the unit direction between the end's two markers. n(t) is normal to d(t) and parallel-transported: the smallest rotation
+from frame to frame that maps d also rotates n. So the ring follows every rotation of the end and never spins about it; the data
+do not contain a spin of the gripper. Half an angular step keeps the points away from the nodes' ring around the first and last
 marker.
 
-In frame 0 the roll of both ends is that of y, projected; DEFORM's cables head along x. So ring node i is the same node in every
-recording of a cable.
+In frame 0 the roll of both ends is the projection of y, because DEFORM's cables are along x. So ring node i is the same node in
+every recording of a cable.
 """
 
 from __future__ import annotations
@@ -44,17 +43,17 @@ X, Y, Z = np.eye(3)
 
 
 def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, where: str) -> np.ndarray:
-    """Points [T, 4 * count, 3], m, of rings around held markers [T, 4, 3] (two at either end, in the order along the cable).
+    """Points [T, 4 * count, 3], m, of rings around held markers [T, 4, 3] (two at each end, in the order along the cable).
 
-    `normals` [2, 3] give the roll of either end in frame 0: those of the body's first and last ring. Raises InputError, naming
-    `where`, if the two markers of an end come nearer than `MIN_DISTANCE`: they have no direction then.
+    `normals` [2, 3] give the roll of each end in frame 0: those of the first and last ring of nodes. Raises InputError, with the
+    name `where`, if the two markers of an end are nearer than `MIN_DISTANCE`, which leaves their direction undefined.
     """
     parts = []
     for normal, end in zip(normals, (held[:, :2], held[:, 2:]), strict=True):
         along = end[:, 1] - end[:, 0]
         length = np.linalg.norm(along, axis=1, keepdims=True)
         if length.min() < MIN_DISTANCE:
-            rule = f"the two held markers of an end must stay {MIN_DISTANCE} m apart"
+            rule = f"the two held markers of an end must be {MIN_DISTANCE} m apart"
             raise InputError(where, rule, f"{length.min():.2g} m in sample {int(length.argmin())}")
         directions = along / length
         transported = transport(directions, normal)
@@ -64,8 +63,10 @@ def clamps(held: np.ndarray, normals: np.ndarray, radius: float, count: int, whe
 
 
 def circle(normal: np.ndarray, across: np.ndarray, radius: float, count: int, turn: float = 0.0) -> np.ndarray:
-    """Offsets [..., count, 3], m, from the center of a circle, with unit vectors [..., 3] normal to the cable. The first lies along
-    `normal`, or `turn` steps of the angle from it."""
+    """Offsets [..., count, 3], m, from the center of a circle, with unit vectors [..., 3] normal to the cable.
+
+    The first offset is along `normal`, rotated by `turn` angular steps.
+    """
     angle = (2 * np.pi * (np.arange(count) + turn) / count)[:, None]
     offsets: np.ndarray = radius * (np.cos(angle) * normal[..., None, :] + np.sin(angle) * across[..., None, :])
     return offsets
@@ -74,14 +75,14 @@ def circle(normal: np.ndarray, across: np.ndarray, radius: float, count: int, tu
 def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Unit normals [T, 3] to unit directions [T, 3], by the smallest rotation from each direction to the next.
 
-    The first is `normal` [3], projected. A vector n normal to d goes to n - (d' n) / (1 + d d') (d + d').
+    The first is the projection of `normal` [3]. A vector n normal to d becomes n - (d' n) / (1 + d d') (d + d').
     """
     first = normal - (normal @ directions[0]) * directions[0]
     normals = np.empty_like(directions)
     normals[0] = first / np.linalg.norm(first)
     for t, (before, after) in enumerate(pairwise(directions)):
         turned = normals[t] - (after @ normals[t]) / (1.0 + before @ after) * (before + after)
-        # Rounding would add up over thousands of samples.
+        # Rounding errors would accumulate over thousands of samples.
         turned -= (turned @ after) * after
         normals[t + 1] = turned / np.linalg.norm(turned)
     return normals
@@ -90,7 +91,7 @@ def transport(directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
 RING = 3
 """Nodes per ring."""
 RING_RADIUS = 0.006
-"""m."""
+"""Radius of rings, m."""
 OVERSAMPLING = 64
 """Evaluations of the spline per marker interval, for its arc length."""
 
@@ -101,9 +102,10 @@ def observe(row: ScenarioRow, path: Path, config: Config, output: Path) -> Obser
 
 
 def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
-    """Read one recording; options in `settings` (config, `mocap`). Meters, float32, world with +z up.
+    """Read one recording with the section `mocap` of the configuration. Meters, float32, +z is up.
 
-    Frame rate `mocap.rate` / stride, all markers visible, tracks = observed markers. Raises InputError naming the file.
+    The frame rate is `mocap.rate` / stride, all markers are visible, and tracks are the observed markers. Raises InputError with
+    the name of the file.
     """
     file = Path(file)
     raw = load_pickle(file)
@@ -115,7 +117,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     needed = settings.frames or MIN_FRAMES
     if frames < needed:
         rule = f"{needed} frames are required after start {settings.start} and stride {settings.stride} (mocap.frames)"
-        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Leave this recording out, or lower these settings.")
+        raise InputError(file, rule, f"{frames} of {len(data)} samples", "Omit this recording, or lower these settings.")
 
     held = [0, 1, count - 2, count - 1]
     observed = markers[:, 2:-2]
@@ -130,7 +132,7 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
     line, rest_body = straightened(markers[0], settings.rings, RING_RADIUS, RING)
     around = (line[held][:, None] + circle(Y, Z, RING_RADIUS, RING, 0.5)).reshape(-1, 3)
     rest_shape = np.concatenate([line[2:-2], rest_body, line[held], around])
-    # Rings turn at the full rate of the record: the fewer samples, the less of a turn is seen.
+    # Rings rotate at the full sampling rate, because fewer samples would lose rotation.
     recorded = data[settings.start :].transpose(0, 2, 1)[: (frames - 1) * settings.stride + 1, held]
     before = data[max(settings.start - 1, 0)].T
     back = np.stack([markers[0], before])[:, held]
@@ -169,19 +171,19 @@ def read(row: ScenarioRow, file: Path, settings: Mocap) -> Observations:
 
 
 def rings(centers: np.ndarray, tangents: np.ndarray, normals: np.ndarray, radius: float, count: int) -> np.ndarray:
-    """Nodes [R * count, 3], m, on circles around `centers` [R, 3] in the planes normal to unit `tangents` [R, 3], ring after ring.
+    """Nodes [R * count, 3], m, on circles around `centers` [R, 3] in the planes normal to unit `tangents` [R, 3], ring by ring.
 
-    The first node of each lies along its unit normal [R, 3] (`rolled`), so node k of one ring is nearest to node k of the next.
+    The first node of each ring is along its unit normal [R, 3] (`rolled`), so node k of a ring is nearest to node k of the next.
     """
     nodes: np.ndarray = centers[:, None] + circle(normals, np.cross(tangents, normals), radius, count)
     return nodes.reshape(-1, 3)
 
 
 def rolled(tangents: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Unit normals [R, 3] to unit tangents [R, 3], equally spaced along the arc: `axis` [3], projected, at both ends.
+    """Unit normals [R, 3] to unit tangents [R, 3] at equal distances along the arc; at both ends the projection of `axis` [3].
 
-    Between them they are transported by the smallest rotations, and what is missing at the far end, at most half a turn, is twist
-    that is even along the arc.
+    The smallest rotations transport the normals. The angle that is missing at the far end, at most a half turn, becomes a uniform
+    twist along the arc.
     """
     normals, last = transport(tangents, axis), tangents[-1]
     missing = np.arctan2(np.cross(normals[-1], axis) @ last, normals[-1] @ axis)
@@ -190,9 +192,9 @@ def rolled(tangents: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def straightened(markers: np.ndarray, number: int, radius: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cable laid out along x without twist: its markers [n, 3] and the nodes of its `number` rings [number * count, 3], m.
+    """The cable straight along x without twist: its markers [n, 3] and the nodes of its `number` rings [number * count, 3], m.
 
-    Arc lengths along the centerline are kept.
+    Arc lengths along the center line are kept.
     """
     _, knots, dense, arc = _arc(markers)
     line = np.zeros((len(markers), 3))
@@ -202,9 +204,9 @@ def straightened(markers: np.ndarray, number: int, radius: float, count: int) ->
 
 
 def centerline(markers: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit tangents [R, 3] of a natural cubic spline through `markers` [n, 3], equally spaced along its arc.
+    """Points and unit tangents [R, 3] of a natural cubic spline through `markers` [n, 3], at equal distances along its arc.
 
-    The first and last point are the first and last marker.
+    The first and last points are the first and last markers.
     """
     spline, _, dense, arc = _arc(markers)
     at = np.interp(np.linspace(0.0, arc[-1], number), arc, dense)
@@ -213,7 +215,7 @@ def centerline(markers: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _arc(markers: np.ndarray) -> tuple[CubicSpline, np.ndarray, np.ndarray, np.ndarray]:
-    """Spline through the markers, its parameters at the markers, dense parameters, and the arc length, m, at each dense one."""
+    """Spline through the markers, its parameters at the markers, dense parameters, and the arc length, m, at dense parameters."""
     knots = arc_of(pieces(markers))
     spline = CubicSpline(knots, markers, bc_type="natural")
     dense = np.unique(np.concatenate([np.linspace(a, b, OVERSAMPLING) for a, b in pairwise(knots)]))

@@ -1,11 +1,11 @@
-"""Nodes that follow the center line of a rod, clamps that move and turn, and a rod with the calls of a `FrameSolver`.
+"""Nodes that follow the center line of a rod, clamps that move and rotate, and a rod with the interface of a `FrameSolver`.
 
 A node on edge j between vertices x_j and x_(j+1) is at
 
     x = x_j + f (x_(j+1) - x_j) + a m1 + b m2,    m2 = t x m1,
 
-with (f, a, b) the place of `Rod.place`. f may lie outside [0, 1]: beyond an end, or in the outer wedge of a bend. A force on the
-node acts on the two vertices by 1 - f and f.
+with (f, a, b) from `Rod.place`. f may be outside [0, 1], beyond an end or in the outer wedge of a bend. A force on the node acts
+on the two vertices with the weights 1 - f and f.
 """
 
 from __future__ import annotations
@@ -24,22 +24,25 @@ from neuspring.physics.controllers import ControllerSprings
 from neuspring.physics.parameters import CONTACT_LIMITS
 
 PARALLEL = 0.99
-"""Cosine to a direction from which a projection normal to it is not worth the name."""
+"""Maximum cosine of an axis to an end; above it, the projection of the axis is too short."""
 SMOOTHING_WEIGHT = 1e-6
-"""Weight of second differences along the vertices against nodes: decides where no node is."""
+"""Weight of second differences along the vertices, relative to nodes. Regularizes vertices without nodes."""
 SETTLING = 4
-"""Rounds in which vertices and directors of frame 0 are made to agree."""
+"""Iterations that make vertices and directors of frame 0 consistent."""
 STEPS_TO_REST = 150
 """Steps towards the equilibrium under gravity."""
 AT_REST = 1e-6
-"""Largest last step of them, of the rod's length."""
+"""Maximum last step, as a fraction of the rod's length."""
 TINY_GRAVITY = 1e-3
-"""m/s^2: without gravity steps are as long as with this."""
+"""Minimum gravity in the length of these steps, m/s^2."""
 GROUND_FIELDS = ("ground_elasticity", "ground_friction")
 
 
 def bind(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest edge [N] of each node [N, 3], m, and its place (f, a, b) [N, 3]; vertices [V, 3], m, and m1 of edges [E, 3]."""
+    """Nearest edge of each node [N], and (f, a, b) of each node on it [N, 3].
+
+    Arguments: vertices [V, 3], m, directors m1 of edges [E, 3] and nodes [N, 3], m.
+    """
     x, points = np.asarray(vertices, np.float64), np.asarray(nodes, np.float64)
     along = np.diff(x, axis=0)
     offset = points[:, None] - x[:-1]
@@ -50,13 +53,13 @@ def bind(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray) -> tupl
 
 
 def bound(rod: Rod, nodes: np.ndarray) -> Rod:
-    """The rod with nodes [N, 3], m, bound to its center line in frame 0. Raises InputError if `axis` lies along a clamp."""
+    """The rod with nodes [N, 3], m, bound to its center line in frame 0. Raises InputError if `axis` is parallel to a clamp."""
     edge, place = bind(rod.vertices, frame_zero(rod)[0], nodes)
     return replace(rod, edge=edge, place=place)
 
 
 def frame_zero(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
-    """Directors m1 of edges [E, 3] and curvatures k1, k2 of joints [V, 2], 1, in frame 0."""
+    """Directors m1 of edges [E, 3] and curvatures k1, k2 of joints [V, 2] in frame 0."""
     require_axis(rod)
     solver = RodSolver([rod], [0.0], Simulation(frame_time=1.0, substeps=1))
     solver.start(torch.tensor(rod.vertices)[None], torch.zeros((1, *rod.vertices.shape), dtype=torch.float64))
@@ -65,47 +68,47 @@ def frame_zero(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Clamps:
-    """Ends of B rods that controllers hold, see `Rod.clamps`, `tilts` and `rolls`."""
+    """Ends of B rods that controllers hold; see `Rod.clamps`, `tilts` and `rolls`."""
 
     ends: tuple[bool, bool]
-    """True for each end that is clamped."""
+    """Whether each end is clamped."""
     held: torch.Tensor
-    """The controller that sets each vertex [B, V]; 0 where none does."""
+    """The controller that sets each vertex [B, V]; 0 for a free vertex."""
     axes: torch.Tensor
-    """`Rod.axis`, for either end [B, 2, 3]."""
+    """`Rod.axis` for each end [B, 2, 3]."""
     clamps: torch.Tensor
-    """[B, 2, 3], m."""
+    """`Rod.clamps` [B, 2, 3], m."""
     lengths: torch.Tensor
-    """Edges of both ends [B, 2], m."""
+    """Lengths of the edges at both ends [B, 2], m."""
     tilts: torch.Tensor | None = None
-    """[B, 2, 2]."""
+    """`Rod.tilts` [B, 2, 2]."""
     rolls: torch.Tensor | None = None
-    """[B, 2]."""
+    """`Rod.rolls` [B, 2]."""
     beside: bool = False
-    """True where held vertices lie beside their controllers."""
+    """Whether held vertices are beside their controllers."""
 
     @classmethod
     def of(cls, rods: Sequence[Rod], device: str = "cpu") -> Clamps:
-        """Those of rods that are clamped alike."""
+        """Clamps of rods with the same clamped ends."""
 
-        def each(values: Sequence[np.ndarray], dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        def stacked(values: Sequence[np.ndarray], dtype: torch.dtype = torch.float64) -> torch.Tensor:
             return torch.tensor(np.stack(values), dtype=dtype, device=device)
 
         first = rods[0]
         held = first.held >= 0
         return cls(
             (bool(held[:2].all()), bool(held[-2:].all())),
-            each([np.maximum(rod.held, 0) for rod in rods], torch.long),
-            each([np.stack([rod.axis, rod.axis]) for rod in rods]),
-            each([rod.clamps for rod in rods]),
-            each([rod.lengths[[0, -1]] for rod in rods]),
-            each([rod.tilts for rod in rods]) if first.laid else None,
-            each([rod.rolls for rod in rods], torch.long) if (first.rolls >= 0).any() else None,
+            stacked([np.maximum(rod.held, 0) for rod in rods], torch.long),
+            stacked([np.stack([rod.axis, rod.axis]) for rod in rods]),
+            stacked([rod.clamps for rod in rods]),
+            stacked([rod.lengths[[0, -1]] for rod in rods]),
+            stacked([rod.tilts for rod in rods]) if first.laid else None,
+            stacked([rod.rolls for rod in rods], torch.long) if (first.rolls >= 0).any() else None,
             bool(first.offsets.size) or first.laid,
         )
 
     def paths(self, controllers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Held vertices [F, B, V, 3], m, and axes of both ends [F, B, 2, 3], of controllers [F, B, C, 3], m."""
+        """Held vertices [F, B, V, 3], m, and axes of both ends [F, B, 2, 3], from controllers [F, B, C, 3], m."""
         count = len(controllers)
         index = self.held[None, ..., None].expand(count, -1, -1, 3)
         points, axes = controllers.gather(2, index), self.axes.expand(count, -1, -1, -1)
@@ -115,7 +118,7 @@ class Clamps:
         return (self.moved(points, axes) if self.beside else points), axes
 
     def moved(self, points: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
-        """Held vertices [..., B, V, 3], m, whose controllers are at points [..., B, V, 3]; other rows stay."""
+        """Held vertices [..., B, V, 3], m, from the positions of their controllers [..., B, V, 3]; other rows do not change."""
         result = points.clone()
         for end, (inner, outer) in enumerate(((1, 0), (-2, -1))):
             if not self.ends[end]:
@@ -127,22 +130,22 @@ class Clamps:
             m1 = axis - (axis * t).sum(dim=-1, keepdim=True) * t
             m1 = m1 / m1.norm(dim=-1, keepdim=True)
             local = torch.stack([t, m1, torch.linalg.cross(t, m1)], dim=-2)
-            place = points[..., inner, :] + (self.clamps[:, end, :, None] * local).sum(dim=-2)
+            vertex = points[..., inner, :] + (self.clamps[:, end, :, None] * local).sum(dim=-2)
             if self.tilts is not None:
                 t = t + (self.tilts[:, end, :, None] * local[..., 1:, :]).sum(dim=-2)
                 along = t / t.norm(dim=-1, keepdim=True) * self.lengths[:, end, None]
-                place = place + inwards * along / 2
-            result[..., inner, :] = place
-            result[..., outer, :] = place - inwards * along
+                vertex = vertex + inwards * along / 2
+            result[..., inner, :] = vertex
+            result[..., outer, :] = vertex - inwards * along
         return result
 
 
 def hanging(rods: Sequence[Rod], controllers: np.ndarray, simulation: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rods at rest under gravity: vertices [B, V, 3], m, directors m1 [B, E, 3], and axes of both ends [B, 2, 3].
 
-    They hang from controllers [B, C, 3], m, and are sought from their `vertices`. Each step is one of backward Euler from rest,
-    (M / h^2 + K) d = f, with h so long that what is as soft as a pendulum of the rod's length comes nearer by a fifth. Raises
-    NumericalFailure where they still move.
+    The rods hang from controllers [B, C, 3], m, and start from their `vertices`. Each step is one step of backward Euler from
+    rest, (M / h^2 + K) d = f. h is so long that a pendulum of the rod's length covers a fifth of its distance per step. Raises
+    NumericalFailure if a rod still moves at the end.
     """
     held, axes = Clamps.of(rods).paths(torch.tensor(np.asarray(controllers, np.float64))[None])
     length = max(float(rod.lengths.sum()) for rod in rods)
@@ -152,16 +155,16 @@ def hanging(rods: Sequence[Rod], controllers: np.ndarray, simulation: Simulation
     solver = RodSolver(plain, [0.0] * len(rods), still)
     x = torch.tensor(np.stack([rod.vertices for rod in rods]))
     solver.start(x, torch.zeros_like(x), axes[0])
-    found, _ = solver.frames(held.expand(STEPS_TO_REST + 1, -1, -1, -1), still=True)
-    moved = float((found[-1] - found[-2]).norm(dim=-1).max())
+    steps, _ = solver.frames(held.expand(STEPS_TO_REST + 1, -1, -1, -1), still=True)
+    moved = float((steps[-1] - steps[-2]).norm(dim=-1).max())
     if not moved < AT_REST * length:
         raise NumericalFailure(f"a rod of {length:.3g} m does not come to rest under gravity: its last step is {moved:.2g} m")
-    solver.start(found[-1], torch.zeros_like(x), axes[0])
+    solver.start(steps[-1], torch.zeros_like(x), axes[0])
     return solver.x.numpy().copy(), solver.directors().numpy().copy(), axes[0].numpy().copy()
 
 
 def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
-    """Vertices [B, V, 3], m, in frame 0 of rods with observed lines [B, V, 3]: beside them, as `offsets` and `clamps` say."""
+    """Vertices in frame 0 of rods with observed lines [B, V, 3], m: beside the lines by `offsets` and `clamps`."""
     points = torch.tensor(np.asarray(lines, np.float64))
     if not rods[0].offsets.size:
         return points.numpy()
@@ -181,7 +184,7 @@ def settled(rods: Sequence[Rod], lines: np.ndarray) -> np.ndarray:
 
 
 def place_on(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """The place (f, a, b) [N, 3] of nodes [N, 3], m, on edges [N]. Inverse of `placed`."""
+    """(f, a, b) [N, 3] of nodes [N, 3], m, on edges [N]. Inverse of `placed`."""
     x, m1 = np.asarray(vertices, np.float64), np.asarray(directors, np.float64)[edge]
     along = np.diff(x, axis=0)[edge]
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -191,13 +194,13 @@ def place_on(vertices: np.ndarray, directors: np.ndarray, nodes: np.ndarray, edg
 
 
 def placed(vertices: torch.Tensor, directors: torch.Tensor, edge: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Nodes [B, N, 3], m, at places [B, N, 3] on edges [B, N]; vertices [B, V, 3], m, and m1 of edges [B, E, 3]."""
+    """Nodes [B, N, 3], m, from (f, a, b) [B, N, 3] on edges [B, N], vertices [B, V, 3], m, and m1 of edges [B, E, 3]."""
     begin, m1 = of_edges(vertices, edge), of_edges(directors, edge)
     along = of_edges(vertices, edge + 1) - begin
     m2 = torch.linalg.cross(along / along.norm(dim=-1, keepdim=True), m1)
     f, a, b = place.split(1, dim=-1)
-    found: torch.Tensor = begin + f * along + a * m1 + b * m2
-    return found
+    nodes: torch.Tensor = begin + f * along + a * m1 + b * m2
+    return nodes
 
 
 def of_edges(values: torch.Tensor, edge: torch.Tensor) -> torch.Tensor:
@@ -206,16 +209,16 @@ def of_edges(values: torch.Tensor, edge: torch.Tensor) -> torch.Tensor:
 
 
 def at_vertices(rod: Rod, values: np.ndarray, held: np.ndarray | None = None) -> np.ndarray:
-    """Values [..., V, 3] at vertices whose interpolation along the edges is nearest to values [..., N, 3] of the nodes.
+    """Values at vertices [..., V, 3] whose interpolation along the edges best fits the values of the nodes [..., N, 3].
 
-    With values `held` [..., C, 3] of controllers, those vertices that are held have theirs. Offsets of nodes from the line are left
-    out, so that of positions it is exact where nodes are vertices, and else as good as they lie evenly around the line.
+    Held vertices have the values `held` [..., C, 3] of their controllers, if given. Offsets of nodes from the line are ignored.
+    So positions are exact if nodes are vertices, and otherwise accurate if nodes are uniform around the line.
     """
     count, nodes = len(rod.vertices), np.arange(len(rod.edge))
     weights = np.zeros((len(nodes), count))
     weights[nodes, rod.edge], weights[nodes, rod.edge + 1] = 1 - rod.place[:, 0], rod.place[:, 0]
     known = rod.held >= 0 if held is not None and not rod.laid else np.zeros(count, bool)
-    # Where no node is, neighbors decide: of positions, their second differences.
+    # Second differences determine vertices without nodes.
     rows = np.concatenate([weights, SMOOTHING_WEIGHT * np.diff(np.eye(count), n=2, axis=0)])
     given = np.asarray(values, np.float64)
     result = np.zeros((*given.shape[:-2], count, 3))
@@ -232,9 +235,10 @@ def radius_of(rod: Rod) -> float:
 
 
 class RodFrames:
-    """The rods of twins with the same hands, with the calls of `FrameSolver` that rollouts make. Their state is that of the rods.
+    """The rods of twins with the same controllers, with the interface of `FrameSolver` that rollouts use.
 
-    A sequence of twins makes rods of as many vertices in lanes; then every tensor has a leading axis [B].
+    The state is that of the rods. For a sequence of twins with equally many vertices, rods are batch lanes, and every tensor has
+    a leading axis [B].
     """
 
     dtype = torch.float32
@@ -256,15 +260,15 @@ class RodFrames:
         self._clamps = Clamps.of(self.rods, device)
         self._x: torch.Tensor | None = None
         self._lengths: torch.Tensor | None = None
-        """Rest lengths of grips that began since the start [B, S]."""
+        """Rest lengths of grasps that began after the start [B, S]."""
 
     def forward(
         self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `FrameSolver.forward`: (x, v) [N, 3] one frame later; controllers move from begin to end [C, 3 or 4].
+        """Like `FrameSolver.forward`: (x, v) [N, 3] after one frame; controllers move from begin to end [C, 3 or 4].
 
-        It goes on from what it returned last, and begins anew where x is frame 0. Raises InputError for other states: nodes do not
-        say how a rod is twisted.
+        Continues from the last returned state, or starts again if x is frame 0. Raises InputError for other states, because nodes
+        do not determine the twist of a rod.
         """
         rows = torch.stack([begin, end]) if self.together else torch.stack([begin, end])[:, None]
         if x is not self._x:
@@ -275,9 +279,10 @@ class RodFrames:
         return x, v
 
     def advance(self, rows: torch.Tensor, every: slice = slice(None)) -> torch.Tensor:
-        """Nodes [F', B, N, 3], m, in double precision, in `every` of the next F frames, whose way points are rows [F + 1, B, C, 3].
+        """Nodes [F', B, N, 3], m, in double precision, in the frames `every` of the next F frames with waypoints [F + 1, B, C,
+        3].
 
-        Rows with a last column are one frame.
+        With a fourth column in the waypoints, F must be 1.
         """
         ends = rows[..., :3].to(self.device, torch.float64)
         self.solver.pull(self._law(rows[0], rows[-1]), ends)
@@ -287,13 +292,13 @@ class RodFrames:
         return nodes
 
     def follow(self, other: RodFrames) -> None:
-        """Take the state of another solver of the same rods, whose springs may be others."""
+        """Copy the state of another solver of the same rods, whose springs may differ."""
         self.solver.follow(other.solver)
         self._place, self._x = other._place, other._x
         self._bind()
 
     def _hands(self, twins: Sequence[Twin]) -> RodHands:
-        """Springs of controllers, and the height at which vertices touch the ground: the radius, or less where they begin lower."""
+        """Springs of controllers, and the heights at which vertices touch the ground: the radius, or less if they start lower."""
         up = twins[0].simulation.up_sign
         heights = [np.minimum(radius_of(rod), np.maximum(up * rod.vertices[:, 2], 0.0)) for rod in self.rods]
         leaders = np.tile(self.grips.leaders.cpu().numpy(), (len(twins), 1))
@@ -303,7 +308,7 @@ class RodFrames:
         )
 
     def _law(self, begin: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
-        """Stiffness, N/m, rest length, m, and dashpot, N s/m, of the springs of hands [B, S, 3] in a frame (controllers.py)."""
+        """Stiffness, N/m, rest length, m, and dashpot, N s/m, of controllers' springs in a frame [B, S, 3] (controllers.py)."""
         if begin.shape[-1] == 4:
             self._lengths = self.grips.taken(self._lengths, self.nodes()[0], begin.to(self.device, torch.float64))
         y, inverse, dashpot = self.grips.applied(self._packed, self._lengths).unbind(dim=-1)
@@ -313,16 +318,18 @@ class RodFrames:
         return torch.stack([y * inverse * acts, 1 / inverse, dashpot * acts], dim=-1)
 
     def start(self, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor) -> None:
-        """Frame 0, with the controllers at `begin` [B, C, 3]. Nodes are bound to the directors there, which depend on what the
-        rod is made of, unless they have their places. Raises InputError for another frame."""
+        """Set the state of frame 0, with the controllers at `begin` [B, C, 3]. Raises InputError for another frame.
+
+        Nodes are bound to the directors of frame 0, which depend on the material; with `lay_out` they keep their binding.
+        """
         if not np.array_equal(x.cpu().numpy(), self._nodes if self.together else self._nodes[0]):
-            raise InputError("twin.body", "a rod begins in frame 0 of its twin", "another state", "Begin at frame 0.")
+            raise InputError("twin.body", "a rod must start in frame 0 of its twin", "another state", "Start at frame 0.")
         for rod in self.rods:
             require_axis(rod)
         speeds = v.cpu().numpy() if self.together else v[None].cpu().numpy()
-        at = self._tensor([at_vertices(rod, own) for rod, own in zip(self.rods, speeds, strict=True)])
+        velocities = self._tensor([at_vertices(rod, speed) for rod, speed in zip(self.rods, speeds, strict=True)])
         _, axes = self._clamps.paths(begin[None, ..., :3].to(self.device, torch.float64))
-        self.solver.start(self._tensor([rod.vertices for rod in self.rods]), at, axes[0])
+        self.solver.start(self._tensor([rod.vertices for rod in self.rods]), velocities, axes[0])
         if not self.rods[0].laid:
             turned = self.solver.directors().cpu().numpy()
             lanes = zip(self.rods, turned, self._nodes, strict=True)
@@ -331,11 +338,11 @@ class RodFrames:
         self._bind()
 
     def _bind(self) -> None:
-        """Tell the solver where the springs of hands act."""
+        """Set where the springs of controllers act."""
         self.solver.bind(self._edge[:, self.grips.nodes], self._place[:, self.grips.nodes])
 
     def nodes(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Nodes and their velocities [B, N, 3] in double precision; what the turn of directors adds to these is left out."""
+        """Nodes and their velocities [B, N, 3] in double precision; velocities ignore the rotation of directors."""
         f, v = self._place[..., :1], self.solver.v
         speeds = (1 - f) * of_edges(v, self._edge) + f * of_edges(v, self._edge + 1)
         return placed(self.solver.x, self.solver.directors(), self._edge, self._place), speeds
@@ -345,25 +352,25 @@ class RodFrames:
 
 
 def _packed(twin: Twin) -> np.ndarray:
-    """Y, 1 / l0 and dashpot of the springs of hands [S, 3], as `ControllerSprings.applied` takes them."""
+    """Y, 1 / l0 and dashpot of the springs of controllers [S, 3], for `ControllerSprings.applied`."""
     lengths = twin.topology.rest_lengths.astype(np.float64)
     return np.stack([twin.material.stiffness.astype(np.float64), 1 / lengths, twin.material.dashpot], axis=1)
 
 
 def _rod(twin: Twin) -> Rod:
-    """The rod of a twin. Raises InputError where the scene asks for what a rod does not do."""
+    """The rod of a twin. Raises InputError for self-collision, which rods do not support."""
     simulation = twin.simulation
     if simulation.self_collision:
-        remedy = "Turn it off in the table of scenarios, or choose a method whose twin is a lattice."
-        raise InputError("twin.body", "a rod touches the ground alone", "self-collision", remedy)
+        remedy = "Turn it off in scenarios.tsv, or choose a method whose twin is a lattice."
+        raise InputError("twin.body", "a rod must not collide with itself", "self-collision", remedy)
     return rod_of(twin)
 
 
 def require_axis(rod: Rod) -> None:
-    """Raise InputError if `axis` lies along an end: its projection there is the first director."""
+    """Raise InputError if `axis` is parallel to an end, where its projection is the first director."""
     ends = [0, -1] if rod.held[-1] >= 0 else [0]
     along = np.diff(rod.vertices, axis=0)[ends]
     cosine = np.abs(along @ rod.axis) / np.linalg.norm(along, axis=1) / np.linalg.norm(rod.axis)
     if cosine.max() > PARALLEL:
         rule = f"the angle to the first and last edge must have a cosine below {PARALLEL}"
-        raise InputError("rod.axis", rule, f"{cosine.max():.3f}", "Name another direction of the world.")
+        raise InputError("rod.axis", rule, f"{cosine.max():.3f}", "Choose another direction of the world.")

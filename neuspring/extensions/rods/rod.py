@@ -13,25 +13,25 @@ from neuspring.core.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Rod(BodyData):
-    """A long thin body as a discrete elastic rod (Bergou 2008, 2010): a center line of V vertices, and a material frame per edge.
+    """A long thin object as a discrete elastic rod (Bergou 2008, 2010): V vertices of a center line, and a frame per edge.
 
     Edge j joins vertices j and j + 1. Its frame is the unit tangent t and two directors m1, m2 = t x m1. A clamp holds the two
-    outer vertices of an end: m1 of edge 0 is `axis` projected, that of the last edge the same turned by `roll` about its tangent.
-    Between them the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint i are
-    k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. With `by_angle` kb is as long as the angle between the edges,
-    not 2 tan of its half. Nodes of the topology follow the line (`edge`, `place`).
+    outer vertices of an end. m1 of edge 0 is the projection of `axis`; m1 of the last edge is the same, rotated by `roll` about
+    its tangent. Between clamps the twist is in equilibrium. With kb = 2 t_(i-1) x t_i / (1 + t_(i-1) t_i) the curvatures of joint
+    i are k1 = kb (m2_(i-1) + m2_i) / 2 and k2 = -kb (m1_(i-1) + m1_i) / 2. With `by_angle` the length of kb is the angle between
+    the edges, instead of 2 tan of half the angle. Nodes of the topology follow the line (`edge`, `place`).
     """
 
     kind: ClassVar[str] = "rod"
     vertices: np.ndarray = array("V,3", np.float64, "m", "center line in frame 0")
-    held: np.ndarray = array("V", np.int32, "1", "the controller that sets each vertex; -1: free")
+    held: np.ndarray = array("V", np.int32, "1", "controller that sets each vertex; -1: free")
     lengths: np.ndarray = array("E", np.float64, "m", "unloaded length of each edge", sign="positive")
     mass: np.ndarray = array("V", np.float64, "kg", "mass of each vertex", sign="positive")
     bending: np.ndarray = array("V", np.float64, "N m^2", "EI at each vertex; the ends are not used", sign="not negative")
     twisting: np.ndarray = array("V", np.float64, "N m^2", "GJ at each vertex; the ends are not used", sign="not negative")
     curvature: np.ndarray = array("V,2", np.float64, "1", "unloaded curvatures k1, k2 of each joint; the ends are not used")
-    edge: np.ndarray = array("N", np.int32, "1", "the edge that each node of the topology follows")
-    place: np.ndarray = array("N,3", np.float64, "1, m, m", "of each node: fraction along its edge, distances along m1 and m2")
+    edge: np.ndarray = array("N", np.int32, "1", "edge that each node of the topology follows")
+    place: np.ndarray = array("N,3", np.float64, "1, m, m", "each node's fraction along its edge, and distances along m1 and m2")
     line: np.ndarray = array(
         "M", np.int32, "1", "the observed line, see `Observations.line`; empty: found among nodes", omitted=True
     )
@@ -40,28 +40,28 @@ class Rod(BodyData):
         "2,3",
         np.float64,
         "m",
-        "inner held vertex of either end from its controller: along t, m1 (without `roll`), m2",
+        "inner held vertex of each end from its controller: along t, m1 (without `roll`), m2",
         omitted=True,
     )
-    """Markers lie beside a cable. The outer held vertex follows with the direction between the two controllers. With
-    `tilts` the middle of the held edge is there."""
+    """Markers are beside the center line of a cable. The direction between the two controllers gives the outer held vertex. With
+    `tilts` the position is that of the middle of the held edge."""
     tilts: np.ndarray = array(
         "K,2",
         np.float64,
         "1",
-        "held edge of either end (K = 2), of its own length: along t + a m1 + b m2; see `clamps`",
+        "direction t + a m1 + b m2 of the held edge of each end (K = 2), which keeps its length; see `clamps`",
         omitted=True,
     )
-    """They are there where the vertices were laid along the unloaded shape (rods/made.py)."""
+    """Present if the vertices are along the unloaded shape (rods/made.py)."""
     rolls: np.ndarray = array(
         "K",
         np.int32,
         "1",
-        "controller towards which m1 of either end's edge lies, from the outer held one; -1: `axis`",
+        "controller towards which m1 of each end's edge points, from the outer held controller; -1: `axis`",
         omitted=True,
     )
     offsets: np.ndarray = array(
-        "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge behind it", omitted=True
+        "V,2", np.float64, "m", "point of the observed line from each free vertex: along m1, m2 of the edge after it", omitted=True
     )
     slip: np.ndarray = array(
         "P,2",
@@ -71,22 +71,22 @@ class Rod(BodyData):
         sign="not negative",
         omitted=True,
     )
-    """Friction inside the rod (Prandtl 1928, Iwan 1966): moments are EI / l (k - k0 + damping dk/dt + sum share (k - z)), where z
-    is dragged along, so that |k - z| is at most l times the second number. In frame 0 z = k. Twist has the same branches."""
-    slip_twist: float = number("1", "twist slips at this times the curvatures of `slip`, rad/m; 0: it has no branches", default=0.0)
+    """Friction inside the rod (Prandtl 1928, Iwan 1966). Moments are EI / l (k - k0 + damping dk/dt + sum share (k - z)), where z
+    follows k, so that |k - z| is at most l times the second number. In frame 0 z = k. Twist has the same branches."""
+    slip_twist: float = number("1", "twist slips at this times the curvatures of `slip`, rad/m; 0: no branches", default=0.0)
     by_angle: float = number("1", "1: the curvature of a joint is its angle; 0: 2 tan of half the angle", default=0.0)
-    """A moment is EI times the angle per length. 2 tan of the half is stiffer by angle^2 / 3, the more so the fewer vertices there
-    are; rods of markers have it, as their authors do."""
+    """A moment is EI times the angle per length. 2 tan of half the angle is stiffer by angle^2 / 3, so the error grows with fewer
+    vertices. Rods of markers use it, like their authors."""
     stretching: float = number("N", "EA")
     damping: float = number("s", "time of inner damping: moments are EI / l (k - k0 + damping dk/dt)")
-    drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; linear drag is the material's")
-    roll: float = number("rad", "turn of the last edge's directors from `axis` projected")
+    drag_quadratic: float = number("1/m", "deceleration by air is this times speed squared; the material has the linear drag")
+    roll: float = number("rad", "rotation of the last edge's directors from the projection of `axis`")
 
     def check(self) -> None:
         edges = len(self.vertices) - 1
         if edges < 2 or len(self.lengths) != edges:
             raise InputError(
-                "rod.lengths", "at least 3 vertices, and one length per edge between them", (edges + 1, len(self.lengths))
+                "rod.lengths", "at least 3 vertices, and one length per edge, are required", (edges + 1, len(self.lengths))
             )
         if not (
             self.stretching > 0
@@ -98,17 +98,17 @@ class Rod(BodyData):
             rule = "stretching > 0, damping, drag_quadratic, slip_twist >= 0 and a finite roll are required"
             raise InputError("rod", rule, (self.stretching, self.damping, self.drag_quadratic, self.slip_twist, self.roll))
         if self.laid and len(self.tilts) != 2:
-            raise InputError("rod.tilts", "one row per end, or none", len(self.tilts))
+            raise InputError("rod.tilts", "one row per end, or none, is required", len(self.tilts))
         if len(self.edge) and not 0 <= self.edge.min() <= self.edge.max() < edges:
-            raise InputError("rod.edge", f"indices must lie in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
+            raise InputError("rod.edge", f"indices must be in [0, {edges})", [int(self.edge.min()), int(self.edge.max())])
 
     def check_with(self, topology: Topology) -> None:
         if len(self.edge) != len(topology.nodes):
-            raise InputError("twin.body", f"one edge per node ({len(topology.nodes)})", len(self.edge))
+            raise InputError("twin.body", f"one edge per node ({len(topology.nodes)}) is required", len(self.edge))
         if topology.object_spring_count:
-            raise InputError("twin.body", "a rod has no springs between its nodes", topology.object_spring_count)
+            raise InputError("twin.body", "a rod must not have springs between nodes", topology.object_spring_count)
         if self.held.max() >= len(topology.controllers):
-            raise InputError("twin.body.held", f"controllers lie in [0, {len(topology.controllers)})", int(self.held.max()))
+            raise InputError("twin.body.held", f"controllers must be in [0, {len(topology.controllers)})", int(self.held.max()))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -116,12 +116,12 @@ class Rod(BodyData):
 
     @property
     def laid(self) -> bool:
-        """True where vertices were laid along the unloaded shape: nobody sees them, and nodes keep their places."""
+        """Whether the vertices are along the unloaded shape: they are not observed, and nodes keep their positions on the line."""
         return bool(self.tilts.size)
 
     @property
     def spans(self) -> np.ndarray:
-        """Unloaded length that belongs to each vertex [V], m: half of its edges."""
+        """Unloaded length of each vertex [V], m: half of its edges."""
         return np.convolve(self.lengths, [0.5, 0.5])
 
 
@@ -131,7 +131,7 @@ def pieces(line: np.ndarray) -> np.ndarray:
 
 
 def arc_of(lengths: np.ndarray) -> np.ndarray:
-    """Distances of the points of a line from its first [n + 1], m, from those between them [n]."""
+    """Arc lengths of the points of a line [n + 1], m, from the distances between them [n]."""
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 

@@ -1,22 +1,23 @@
-"""Discrete elastic rods (Bergou et al. 2008, 2010) in lanes: many rods of as many vertices advance together, one thread each.
+"""Discrete elastic rods (Bergou et al. 2008, 2010) in batch lanes: rods with equally many vertices advance together.
 
-Forces are the gradients of the energies in README.md, written out. A substep is implicit, so that it stays stable for the stiffest
-cable. With BDF2 (backward Euler in the first substep and after a
-contact)
+Each rod has one thread.
 
-    x1 = x* + g v1,   v1 = v* + g a(x1, v1),   x* = (4 x0 - x_) / 3,   v* = (4 v0 - v_) / 3,   g = 2 h / 3,
+Forces are the gradients of the energies in README.md. A substep is implicit, so that it is stable for the stiffest cable. It uses
+BDF2, or backward Euler in the first substep and after a contact:
 
-and x1 = p + d around the extrapolated p = 2 x0 - x_, where forces are evaluated once:
+    x1 = x* + g v1,   v1 = v* + g a(x1, v1),   x* = (4 x0 - x_) / 3,   v* = (4 v0 - v_) / 3,   g = 2 h / 3
+
+The solution x1 = p + d is around the extrapolated p = 2 x0 - x_, where forces are evaluated once:
 
     (M (1 + g c) / g^2 + K) d = f(p) + M (v* / g - (1 + g c) (p - x*) / g^2).
 
-c is the drag. Twist is quasi-static: the angles theta have no mass, and moments about the tangents are in balance, those of inner
-damping among them. So d goes on with changes of the angles, extrapolated as p is, and K is the Gauss-Newton matrix of bending,
-damping, twist and stretching by both; the tension of the substep before turns edges. K couples three neighbors, so the system is
-banded and solved by Cholesky. Held vertices and the axes of clamps follow their paths linearly within a frame, and the directors of
-clamps are the axes projected.
+c is the drag. Twist is quasi-static: the angles theta have no mass, and the moments about the tangents, including inner damping,
+are in balance. So d also contains the changes of the angles, which are extrapolated like p. K is the Gauss-Newton matrix of
+bending, damping, twist and stretching; the tension of the previous substep gives edges their lateral stiffness. K couples three
+neighbors, so the system is banded and solved by Cholesky. Held vertices and the axes of clamps move linearly within a frame, and
+the directors of clamps are the projected axes.
 """
-# No postponed annotations here: Warp reads the evaluated types of the kernels below.
+# This module does not postpone annotations: Warp reads the evaluated types of the kernels below.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -31,18 +32,18 @@ from neuspring.core.device import load
 from neuspring.extensions.rods.rod import Rod
 
 TWIST_STEPS = 60
-"""Newton steps of the twist in frame 0, where it starts from an even one, at most."""
+"""Maximum number of Newton steps of the twist in frame 0, which starts uniform."""
 MAX_TURN = wp.float64(0.5)
-"""Largest change of an angle in a step of Newton, rad."""
+"""Maximum change of an angle in a Newton step, rad."""
 LEAST_PIVOT = wp.float64(1e-3)
-"""Least pivot of the matrix of the steps in frame 0, over the entry of the diagonal."""
+"""Minimum pivot of the matrix of these steps, relative to its diagonal entry."""
 TINY = wp.float64(1e-12)
 BAND_WIDTH = 11
-"""Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r is of x_i, row 4 j + 3 of theta_j."""
+"""Entries of a row of the banded matrix, from the diagonal to the left. Row 4 i + r belongs to x_i, row 4 j + 3 to theta_j."""
 JOINT = 11
-"""Variables that a joint depends on: x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1), in this order."""
+"""Number of variables of a joint, in the order x_(i-1), theta_(i-1), x_i, theta_i, x_(i+1)."""
 FREE_TURN_STIFFNESS = wp.float64(1e-9)
-"""Fraction of GJ / l: stiffness against turning of a rod that nothing else turns."""
+"""Stiffness against rotation about the tangent, as a fraction of GJ / l, for a rod without any other."""
 
 real = wp.float64
 vec3 = wp.vec3d
@@ -67,7 +68,7 @@ class RodState:
     twisting: Scalars
     curvature: Pairs
     slip: Pairs
-    """Branches that slip [B, branches], see `Rod.slip`."""
+    """Branches that slip [B, branches]; see `Rod.slip`."""
     slip_twist: Numbers
     by_angle: Numbers
     stretching: Numbers
@@ -76,7 +77,7 @@ class RodState:
     drag_quadratic: Numbers
     roll: Numbers
     axis: Vectors
-    """Direction whose projection gives the roll of either end [B, 2], now."""
+    """Current direction whose projection gives the roll of each end [B, 2]."""
     held: Indices
     x: Vectors
     v: Vectors
@@ -86,11 +87,11 @@ class RodState:
     """Extrapolated positions."""
     t: Vectors
     u: Vectors
-    """Reference directors, carried by parallel transport."""
+    """Reference directors, which are parallel-transported."""
     m1: Vectors
     m2: Vectors
     kb: Vectors
-    """Curvature binormals, see `Rod.by_angle`."""
+    """Curvature binormals; see `Rod.by_angle`."""
     theta: Scalars
     theta_before: Scalars
     w: wp.array3d(dtype=real)
@@ -101,9 +102,9 @@ class RodState:
     k: Pairs
     k_before: Pairs
     z: wp.array3d(dtype=vec3)
-    """k1, k2 and the twist of each joint at which a branch has no moment [B, V, branches]."""
+    """k1, k2 and the twist of each joint for which a branch has no moment [B, V, branches]."""
     history: wp.array(dtype=wp.int32)
-    """Substeps since the last start or contact."""
+    """Number of substeps since the last start or contact."""
     a: wp.array3d(dtype=real)
     """Banded matrix [B, 4 V, 11]: entry q of row i is A[i, i - q]."""
     b: Scalars
@@ -111,24 +112,24 @@ class RodState:
     diagonal: Scalars
     rest: Scalars
     spring_edge: Indices
-    """Springs of hands [B, S]: the edge that each acts on,"""
+    """Edge on which each spring of a controller acts [B, S]."""
     spring_place: Vectors
-    """Place that each spring acts at [B, S]: fraction along the edge, distances along m1 and m2, m."""
+    """Point on which each spring acts [B, S]: fraction along the edge, distances along m1 and m2, m."""
     leader: Indices
     """Controller that pulls each spring [B, S]."""
     law: Vectors
-    """Law of each spring [B, S]: stiffness, N/m, rest length, m, dashpot, N s/m."""
+    """Stiffness, N/m, rest length, m, and dashpot, N s/m, of each spring [B, S]."""
     hands: Vectors
     """Controllers at the end of the substep."""
     clearance: Scalars
-    """Height over the ground at which each vertex touches it, m; below -1: there is no ground."""
+    """Height over the ground at which each vertex touches it, m; below -1: no ground."""
     elasticity: Numbers
     friction: Numbers
 
 
 @wp.func
 def transported(u: vec3, before: vec3, after: vec3):
-    """A unit vector normal to `before`, turned by the smallest rotation to `after`."""
+    """A unit vector normal to `before`, rotated by the smallest rotation from `before` to `after`."""
     w = u - (wp.dot(after, u) / (real(1.0) + wp.dot(before, after) + TINY)) * (before + after)
     w = w - wp.dot(w, after) * after
     return wp.normalize(w)
@@ -136,7 +137,7 @@ def transported(u: vec3, before: vec3, after: vec3):
 
 @wp.func
 def projected(d: vec3, t: vec3):
-    """The unit vector along the part of d that is normal to t."""
+    """The unit vector of the component of d normal to t."""
     w = d - wp.dot(d, t) * t
     return wp.normalize(w)
 
@@ -149,26 +150,26 @@ def turn(a: vec3, b: vec3, t: vec3):
 
 @wp.func
 def edge_length(s: RodState, lane: int, j: int):
-    """Length of edge j at the positions p, m."""
+    """Length of edge j, m, at the positions p."""
     return wp.length(s.p[lane, j + 1] - s.p[lane, j])
 
 
 @wp.func
 def clamp_angle(s: RodState, lane: int, j: int, end: int):
-    """Angle of the axis of an end from the reference director of edge j."""
+    """Angle from the reference director of edge j to the axis of an end."""
     return turn(s.u[lane, j], projected(s.axis[lane, end], s.t[lane, j]), s.t[lane, j])
 
 
 @wp.func
 def near(angle: real, before: real):
-    """The angle plus the multiple of 2 pi that brings it nearest to `before`."""
+    """The angle plus the multiple of 2 pi that makes it nearest to `before`."""
     circle = real(6.283185307179586)
     return angle - circle * wp.round((angle - before) / circle)
 
 
 @wp.func
 def set_directors(s: RodState, lane: int, edges: int):
-    """Material directors from reference directors and angles."""
+    """Set material directors from reference directors and angles."""
     for j in range(edges):
         c = wp.cos(s.theta[lane, j])
         n = wp.sin(s.theta[lane, j])
@@ -179,7 +180,7 @@ def set_directors(s: RodState, lane: int, edges: int):
 
 @wp.func
 def curvature(s: RodState, lane: int, i: int):
-    """k1 and k2 of joint i, see `Rod`."""
+    """k1 and k2 of joint i; see `Rod`."""
     kb = s.kb[lane, i]
     k1 = real(0.5) * wp.dot(kb, s.m2[lane, i - 1] + s.m2[lane, i])
     k2 = real(-0.5) * wp.dot(kb, s.m1[lane, i - 1] + s.m1[lane, i])
@@ -200,7 +201,7 @@ def twist(s: RodState, lane: int, i: int):
 
 @wp.func
 def kept(s: RodState, lane: int, i: int, branch: int, away: vec3):
-    """The parts of a branch's curvature and of its twist, as they would be if it stuck, that are left where it slips."""
+    """Factors that reduce the curvature and twist of a branch to its slip limits."""
     most = s.slip[lane, branch][1] * joint_length(s, lane, i)
     bent = most / wp.max(wp.max(wp.length(vec2(away[0], away[1])), most), TINY)
     most = s.slip_twist[lane] * most
@@ -209,9 +210,9 @@ def kept(s: RodState, lane: int, i: int, branch: int, away: vec3):
 
 @wp.func
 def slid(e: vec2, move: vec2, most: real):
-    """e = k - z, not longer than `most`, after k has gone straight by `move`: de = dk, where |e| = most less its part along e.
+    """e = k - z with |e| <= `most`, after k moves straight by `move`: de = dk, at |e| = most without its component along e.
 
-    As it slides, half its angle to the way has a tangent that falls by exp(-way / most).
+    During the slip, the tangent of half the angle between e and the direction of motion decreases by exp(-distance / most).
     """
     after = e + move
     if wp.length(after) <= most:
@@ -229,7 +230,7 @@ def slid(e: vec2, move: vec2, most: real):
 
 @wp.func
 def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held: bool):
-    """Angles of edges that no clamp holds, from `theta` to a minimum of the energy, by tridiagonal Newton steps."""
+    """Set the angles of free edges to a minimum of the energy, from `theta` on, by tridiagonal Newton steps."""
     low = wp.where(first_held, 1, 0)
     high = wp.where(last_held, edges - 2, edges - 1)
     for _step in range(TWIST_STEPS):
@@ -252,7 +253,7 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
             b2 = real(-0.5) * wp.dot(kb, s.m2[lane, i])
             s.rest[lane, i - 1] = s.rest[lane, i - 1] - y * m + e * (k[0] * a1 + k[1] * a2)
             s.rest[lane, i] = s.rest[lane, i] + y * m + e * (k[0] * b1 + k[1] * b2)
-            # The last terms are of second derivatives: those of k1 are a2 and b2, those of k2 -a1 and -b1.
+            # The last terms have second derivatives, which are a2 and b2 for k1, -a1 and -b1 for k2.
             s.diagonal[lane, i - 1] = s.diagonal[lane, i - 1] + y + e * (a1 * a1 + a2 * a2 + k[0] * a2 - k[1] * a1)
             s.diagonal[lane, i] = s.diagonal[lane, i] + y + e * (b1 * b1 + b2 * b2 + k[0] * b2 - k[1] * b1)
             s.lower[lane, i] = e * (a1 * b1 + a2 * b2) - y
@@ -262,7 +263,7 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
                 w = s.lower[lane, j] / s.diagonal[lane, j - 1]
                 pivot = pivot - w * s.lower[lane, j]
                 s.rest[lane, j] = s.rest[lane, j] - w * s.rest[lane, j - 1]
-            # Positive pivots lead to a minimum, not to a saddle.
+            # Positive pivots lead to a minimum instead of a saddle point.
             s.diagonal[lane, j] = wp.max(wp.abs(pivot), LEAST_PIVOT * wp.abs(s.diagonal[lane, j]) + TINY)
         z = real(0.0)
         largest = real(0.0)
@@ -282,8 +283,8 @@ def solve_twist(s: RodState, lane: int, edges: int, first_held: bool, last_held:
 
 @wp.func
 def bow(cosine: real):
-    """Angle over 2 tan of its half, and the derivative of its logarithm by the cosine."""
-    # By the squared tangent of the half; near 0 by its series.
+    """An angle over 2 tan of half the angle, and the derivative of its logarithm with respect to the cosine."""
+    # A function of the squared tangent of half the angle; near 0 its series.
     x = wp.max(real(1.0) - cosine, real(0.0)) / (real(1.0) + cosine + TINY)
     factor = real(1.0) - x / real(3.0) + x * x / real(5.0)
     slope = real(-1.0) / real(3.0) + real(0.4) * x
@@ -296,7 +297,7 @@ def bow(cosine: real):
 
 @wp.func
 def set_geometry(s: RodState, lane: int, edges: int):
-    """Tangents, reference directors, their twist, and curvature binormals at the positions p."""
+    """Set tangents, reference directors, their twist, and curvature binormals at the positions p."""
     for j in range(edges):
         t = wp.normalize(s.p[lane, j + 1] - s.p[lane, j])
         s.u[lane, j] = transported(s.u[lane, j], s.t[lane, j], t)
@@ -315,7 +316,7 @@ def set_geometry(s: RodState, lane: int, edges: int):
 
 @wp.kernel(enable_backward=False)
 def begin(s: RodState):
-    """Directors and twist of frame 0 at the positions x."""
+    """Set directors and twist of frame 0 at the positions x."""
     lane = wp.tid()
     edges = s.x.shape[1] - 1
     first_held = s.held[lane, 0] >= 0 and s.held[lane, 1] >= 0
@@ -352,7 +353,7 @@ def begin(s: RodState):
 
 @wp.func
 def add_block(s: RodState, lane: int, i: int, j: int, block: mat33):
-    """Add to the rows of vertex i and the columns of vertex j <= i."""
+    """Add a block to the rows of vertex i and the columns of vertex j <= i."""
     for r in range(3):
         for c in range(3):
             q = 4 * (i - j) + r - c
@@ -362,21 +363,21 @@ def add_block(s: RodState, lane: int, i: int, j: int, block: mat33):
 
 @wp.func
 def add_force(s: RodState, lane: int, i: int, force: vec3):
-    """Add to the right-hand side of vertex i."""
+    """Add a force to the right-hand side of vertex i."""
     for r in range(3):
         s.b[lane, 4 * i + r] = s.b[lane, 4 * i + r] + force[r]
 
 
 @wp.func
 def put(s: RodState, lane: int, row: int, column: int, value: vec3):
-    """A derivative by a position."""
+    """Store a derivative with respect to a position."""
     for r in range(3):
         s.w[lane, row, column + r] = value[r]
 
 
 @wp.func
 def slopes(s: RodState, lane: int, i: int, k: vec2):
-    """Derivatives of k1, k2 and the twist of joint i with the curvatures k, by what it depends on."""
+    """Derivatives of k1, k2 and the twist of joint i, which has curvatures k, with respect to its variables."""
     before = s.t[lane, i - 1]
     after = s.t[lane, i]
     inverse = real(1.0) / (real(1.0) + wp.dot(before, after) + TINY)
@@ -393,7 +394,7 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
         bowed = bow(cosine)
         n1 = bowed[0] * n1
         n2 = bowed[0] * n2
-    # By the two edges.
+    # Derivatives with respect to the two edges.
     a1 = r0 * (wp.cross(after, n2) - k[0] * middle)
     b1 = r1 * (-k[0] * middle - wp.cross(before, n2))
     a2 = r0 * (-k[1] * middle - wp.cross(after, n1))
@@ -428,10 +429,10 @@ def slopes(s: RodState, lane: int, i: int, k: vec2):
 
 @wp.func
 def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real, oldest: real):
-    """Forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__.
+    """Add forces and moments of bending and twist, and their Gauss-Newton matrix. dk/dt = rate k - older k_ + oldest k__.
 
-    The matrix of a branch that slips is its secant from z: a parabola that is nowhere below the branch's potential, so that a
-    step never overshoots. Its tangent, 0 along the slip, chatters where modes are fast for a substep.
+    A branch that slips uses its secant from z: this parabola is never below the branch's potential, so that a step does not
+    overshoot. The tangent, which is 0 along the slip, chatters if modes are fast for a substep.
     """
     for i in range(1, edges):
         joint = joint_length(s, lane, i)
@@ -463,14 +464,14 @@ def assemble_bending(s: RodState, lane: int, edges: int, rate: real, older: real
                 s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
         for side in range(2):
             c = 3 + 4 * side
-            # The second derivative of k1 by an angle is the first of k2, and that of k2 less that of k1.
+            # The second derivative of k1 with respect to an angle is the first of k2; that of k2 is minus the first of k1.
             second = moment[0] * s.w[lane, 1, c] - moment[1] * s.w[lane, 0, c]
             s.a[lane, first + c, 0] = s.a[lane, first + c, 0] + wp.max(second, real(0.0)) + FREE_TURN_STIFFNESS * z
 
 
 @wp.func
 def assemble_stretching(s: RodState, lane: int, edges: int):
-    """Forces and matrix of stretching, with the tension of the substep before across edges."""
+    """Add forces and matrix of stretching; the tension of the previous substep gives the stiffness across edges."""
     unit = wp.identity(n=3, dtype=real)
     for j in range(edges):
         t = s.t[lane, j]
@@ -488,9 +489,9 @@ def assemble_stretching(s: RodState, lane: int, edges: int):
 
 @wp.func
 def assemble_hands(s: RodState, lane: int, rate: real, more: real):
-    """Forces, moments and Gauss-Newton matrix of springs from controllers to places on edges; only tension is stiff across.
+    """Add forces, moments and Gauss-Newton matrix of springs from controllers to points on edges; only tension is stiff across.
 
-    With the offset o of the place, which turns with its edge e, and the fraction f along it, the place moves by
+    A point at the fraction f of edge e, with an offset o that rotates with e, moves by
     J0 dx_j + (t x o) dtheta_j + J1 dx_(j+1), J0 = (1 - f) 1 + t o^T / |e|, J1 = f 1 - t o^T / |e|.
     """
     unit = wp.identity(n=3, dtype=real)
@@ -527,19 +528,19 @@ def assemble_hands(s: RodState, lane: int, rate: real, more: real):
                 for c in range(r + 1):
                     value = column[0] * s.w[lane, 0, c] + column[1] * s.w[lane, 1, c] + column[2] * s.w[lane, 2, c]
                     s.a[lane, first + r, r - c] = s.a[lane, first + r, r - c] + value
-            # The second derivative by the angle, where it makes the twist stiffer.
+            # The second derivative with respect to the angle, if it is positive.
             s.a[lane, first + 3, 0] = s.a[lane, first + 3, 0] + wp.max(pull * wp.dot(d, o), real(0.0))
 
 
 @wp.func
 def velocity_at(s: RodState, lane: int, i: int, rate: real, more: real):
-    """The velocity at the end of the substep of a vertex that is at p then."""
+    """Velocity of a vertex at the end of the substep, if it is then at p."""
     return rate * (s.p[lane, i] - (real(1.0) + more) * s.x[lane, i] + more * s.x_before[lane, i])
 
 
 @wp.func
 def touch_ground(s: RodState, lane: int, i: int, up: real):
-    """A vertex that went below its clearance is put on it, and reflected as a node is (motion.py); then backward Euler follows."""
+    """Move a vertex below its clearance to it, and reflect it like a node (motion.py); the next substep is backward Euler."""
     x = s.x[lane, i]
     v = s.v[lane, i]
     if x[2] * up < s.clearance[lane, i] and v[2] * up < real(0.0):
@@ -553,7 +554,7 @@ def touch_ground(s: RodState, lane: int, i: int, up: real):
 
 @wp.func
 def set_known(s: RodState, lane: int, row: int, rows: int):
-    """An unknown that does not change: its equation is 1 d = 0."""
+    """Fix an unknown: its equation becomes 1 d = 0."""
     for q in range(BAND_WIDTH):
         s.a[lane, row, q] = real(0.0)
         if row + q < rows:
@@ -564,7 +565,7 @@ def set_known(s: RodState, lane: int, row: int, rows: int):
 
 @wp.func
 def solve(s: RodState, lane: int, rows: int):
-    """Banded Cholesky in place, with inverse diagonals; the solution is in b. A row is in registers, and its loops are unrolled."""
+    """Solve by banded Cholesky in place, with inverse diagonals; b gets the solution. A row is in registers, loops are unrolled."""
     for i in range(rows):
         row = Row()
         for q in range(11):
@@ -611,9 +612,9 @@ def advance(
     found: Paths,
     turned: Paths,
 ):
-    """Frames of each lane; positions and directors at the end of each are `found` and `turned`. `still`: each begins at rest.
+    """Simulate frames of each lane; `found` and `turned` get their final positions and directors. `still`: frames start at rest.
 
-    All is one kernel: with a frame as a function of its own, substeps take a fifth longer on a CPU.
+    Everything is one kernel: with a separate function for a frame, substeps take a fifth longer on a CPU.
     """
     lane = wp.tid()
     vertices = s.x.shape[1]
@@ -627,7 +628,7 @@ def advance(
                 s.v[lane, i] = vec3()
         for step in range(substeps):
             part = real(step + 1) / real(substeps)
-            # BDF2, or backward Euler where there is no substep before.
+            # BDF2, or backward Euler without a previous substep.
             g = h
             more = real(0.0)
             if s.history[lane] > 0:
@@ -644,7 +645,7 @@ def advance(
                 else:
                     s.p[lane, i] = s.x[lane, i] + h * s.v[lane, i]
             set_geometry(s, lane, edges)
-            # Angles go on as they went.
+            # Angles are extrapolated.
             for j in range(edges):
                 before = s.theta_before[lane, j]
                 s.theta_before[lane, j] = s.theta[lane, j]
@@ -652,7 +653,7 @@ def advance(
                     s.theta[lane, j] = real(2.0) * s.theta[lane, j] - before
             for end in range(2):
                 s.axis[lane, end] = axes[frame, lane, end] + part * (axes[frame + 1, lane, end] - axes[frame, lane, end])
-            # The directors of clamps keep to the axis, whatever way the tangents took.
+            # The directors of clamps follow the axis, independent of the path of the tangents.
             if first_held:
                 s.theta[lane, 0] = near(clamp_angle(s, lane, 0, 0), s.theta[lane, 0])
             if last_held:
@@ -730,7 +731,7 @@ def advance(
 
 @dataclass(frozen=True)
 class RodHands:
-    """Forces on B rods besides clamps: S springs of controllers, and the ground."""
+    """Forces on B rods in addition to clamps: S springs of controllers, and the ground."""
 
     controllers: int
     leader: np.ndarray
@@ -742,15 +743,15 @@ class RodHands:
 
 
 OF_RODS = [each.name for each in fields(Rod) if each.name in RodState.vars]
-"""Parameters that are those of `Rod`, with a leading axis [B]."""
+"""Parameters from `Rod`, with a leading axis [B]."""
 OF_HANDS = ("spring_edge", "spring_place", "law", "hands")
-"""State of springs, which another solver of the same rods may have others of."""
+"""State of springs, which may differ between solvers of the same rods."""
 STATE = [name for name in RodState.vars if name not in (*OF_RODS, "drag", *OF_HANDS, *(each.name for each in fields(RodHands)))]
-"""State that `RodSolver.follow` takes over."""
+"""State that `RodSolver.follow` copies."""
 
 
 class RodSolver:
-    """Simulates frames of rods in lanes. Tensors are float64 and have a leading axis [B]."""
+    """Simulates frames of rods in batch lanes. Tensors are float64 and have a leading axis [B]."""
 
     def __init__(
         self,
@@ -760,7 +761,7 @@ class RodSolver:
         device: str = "cpu",
         hands: RodHands | None = None,
     ) -> None:
-        """Rods with as many vertices, each with its linear drag, 1/s."""
+        """Create a solver of rods with equally many vertices, each with its linear drag, 1/s."""
         self.rods, self.simulation, self.device, self.hands = rods, simulation, device, hands
         count, vertices = len(rods), len(rods[0].mass)
         self.count, self.vertices = count, vertices
@@ -770,7 +771,7 @@ class RodSolver:
         shapes |= {"hands": (count, controllers), "z": (count, vertices, len(rods[0].slip))}
         shapes |= {"a": (count, 4 * vertices, 11), "w": (count, 3, 11), "b": (count, 4 * vertices)}
         values = {name: np.array([getattr(rod, name) for rod in rods]) for name in OF_RODS}
-        # Either end has an axis.
+        # Each end has an axis.
         values |= {"axis": np.repeat(values["axis"][:, None], 2, axis=1), "drag": np.array(drags, np.float64)}
         self._state = RodState()
         for name, variable in RodState.vars.items():
@@ -783,25 +784,25 @@ class RodSolver:
         self._ends = wp.to_torch(self._state.hands)[None]
 
     def bind(self, edge: torch.Tensor, place: torch.Tensor) -> None:
-        """Set where the springs of hands act: on edges [B, S], at places [B, S, 3] as in `Rod.place`."""
+        """Set where the springs of controllers act: on edges [B, S], at (f, a, b) [B, S, 3] as in `Rod.place`."""
         self._put(self._state.spring_edge, edge)
         self._put(self._state.spring_place, place)
 
     def pull(self, law: torch.Tensor, hands: torch.Tensor) -> None:
-        """Set how they act in the next frames: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3]; none where both are 0.
+        """Set the springs of the next frames: stiffness, N/m, rest length, m, and dashpot, N s/m [B, S, 3].
 
-        Controllers move linearly between rows of hands [F + 1, B, C, 3], m.
+        A spring without stiffness and dashpot does not act. Controllers move linearly between rows of hands [F + 1, B, C, 3], m.
         """
         self._put(self._state.law, law)
         self._ends = hands
 
     def follow(self, other: "RodSolver") -> None:
-        """Take the state of another solver of the same rods."""
+        """Copy the state of another solver of the same rods."""
         for name in STATE:
             wp.copy(getattr(self._state, name), getattr(other._state, name))
 
     def start(self, x: torch.Tensor, v: torch.Tensor, axis: torch.Tensor | None = None) -> None:
-        """State of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s; axes of clamps [B, 2, 3], if not the rods'."""
+        """Set the state of frame 0: positions [B, V, 3], m, velocities [B, V, 3], m/s, and optional axes of clamps [B, 2, 3]."""
         for name, values in (("x", x), ("v", v), ("axis", axis)):
             if values is not None:
                 self._put(getattr(self._state, name), values)
@@ -810,10 +811,10 @@ class RodSolver:
     def frames(
         self, held: torch.Tensor, axis: torch.Tensor | None = None, *, still: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """F frames: positions [F, B, V, 3], m, and m1 of edges [F, B, E, 3] at the end of each.
+        """Simulate F frames; returns positions [F, B, V, 3], m, and m1 of edges [F, B, E, 3] at the end of each frame.
 
-        Held vertices move linearly between rows of held [F + 1, B, V, 3], and so do the axes of clamps [F + 1, B, 2, 3]; without
-        any they stay. `still`: all velocities are 0 at the begin of each frame, which so is a step down towards equilibrium.
+        Held vertices move linearly between rows of held [F + 1, B, V, 3], axes of clamps between rows of axis [F + 1, B, 2, 3];
+        without rows the axes do not move. With `still` each frame starts at rest, so that it is a step towards equilibrium.
         """
         simulation, count = self.simulation, len(held) - 1
         axes = wp.to_torch(self._state.axis).clone().expand(count + 1, -1, -1, -1) if axis is None else axis
@@ -827,7 +828,7 @@ class RodSolver:
         return x, m1[:, :, :-1]
 
     def frame(self, held_from: torch.Tensor, held_to: torch.Tensor) -> None:
-        """One frame, as `frames`."""
+        """Simulate one frame; see `frames`."""
         self.frames(torch.stack([held_from, held_to]))
 
     def _vectors(self, values: torch.Tensor) -> Any:

@@ -8,18 +8,18 @@ from neuspring.config import ScenarioRow, parse
 from neuspring.scenes.sources import Source
 
 RECORDING = re.compile(r"(?P<cable>[A-Za-z0-9][\w.-]*)_(?P<part>train|eval)_(?P<number>\d+)")
-"""Name of a recording of DEFORM's data set, which lies in CABLE/PART/NUMBER.pkl."""
+"""Name of a recording of DEFORM's data set, whose file is CABLE/PART/NUMBER.pkl."""
 
 
 def row_of(name: str) -> ScenarioRow | None:
-    """The row of a recording of a cable: its name says where it lies, as DLO3_train_15 is DLO3/train/15.pkl."""
-    if not (found := RECORDING.fullmatch(name)):
+    """The scenario of a recording of a cable; the name gives the path: DLO3_train_15 is DLO3/train/15.pkl."""
+    if not (match := RECORDING.fullmatch(name)):
         return None
     values = {
         "scenario": name,
         "source": "mocap",
-        "category": found["cable"],
-        "path": f"{found['cable']}/{found['part']}/{found['number']}.pkl",
+        "category": match["cable"],
+        "path": f"{match['cable']}/{match['part']}/{match['number']}.pkl",
         "self_collision": False,
         "ground": False,
     }

@@ -1,4 +1,4 @@
-"""Spring-Gaus as a baseline: what the workflow asks before any job exists, so that nothing heavy is imported."""
+"""Spring-Gaus as a baseline. The workflow imports this module before any job exists, so it imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from neuspring.core.weights import find_file, hub_folder
 from neuspring.extensions.spring_gaus.settings import SpringGaus
 
 VGG16, DIGEST = "vgg16-397923af.pth", "397923af"
-"""Weights for a term of the loss, and the first digits of their SHA-256, which by torch hub's convention are in the file's name."""
+"""Weights for a loss term, and the first digits of their SHA-256, which Torch Hub puts into the file name."""
 
 
 def find_vgg16() -> Path | str:
-    """The weight file in torch hub's cache, else one line that says why there is none."""
+    """The weight file in Torch Hub's cache, or one line with the reason why it is missing."""
     return find_file("VGG16 weights", None, [hub_folder() / VGG16], DIGEST, False)
 
 
@@ -32,12 +32,12 @@ SPRING_GAUS = Baseline(
     reads=_reads,
     own_splats=True,
     notes={
-        # Not why the weights are not there: that names places on this machine.
+        # The note omits the reason, which names paths of this machine.
         "vgg16": (
             lambda fact: fact not in ("computed", "not asked for"),
-            "without the loss of VGG16's features, whose weights are not there",
+            "without the loss of VGG16's features, whose weights are missing",
         ),
-        "links": (lambda fact: fact == 0, "no anchor lies near a controller in frame 0, so the hands move nothing"),
+        "links": (lambda fact: fact == 0, "no anchor is near a controller in frame 0, so the hands move no anchor"),
     },
     weights=OptionalWeights(
         what="VGG16 (Spring-Gaus' features)", file=VGG16, address=f"https://download.pytorch.org/models/{VGG16}", find=find_vgg16

@@ -1,17 +1,18 @@
-"""Anchors, what each feels, and their motion: one substep and its adjoint as kernels, and frames of them.
+"""Anchors and their motion: the forces, one substep and its adjoint as kernels, and frames of substeps.
 
-With d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and the rank r of neighbor j by distance in frame 0, anchor i feels
+Let d = |x_j - x_i|, n = (x_j - x_i) / d, strain e = d / l - 1 and r the rank of neighbor j by distance in frame 0. The forces on
+anchor i are
 
     spring   (s_i / l) eta_r (d - l) (1 + |e|)^p n       (zero where |d - l| < 1e-6 m)
     damping  (zeta / l) ((v_j - v_i) . n) n
-    control  c (|q - x_i| / L - 1) (q - x_i) / |q - x_i|  from each controller q with a link to it
+    control  c (|q - x_i| / L - 1) (q - x_i) / |q - x_i|  from each linked controller q
     gravity  at unit mass
 
-Nothing reacts on j: this is a gather, not the symmetric spring of `neuspring.physics.springs`. Integration is semi-implicit. After
-the step, anchors at or below the ground are put on it. Their velocity along z becomes zero, that along the ground is multiplied by
-phi.
+Springs are directed: unlike those of `neuspring.physics.springs`, they exert no force on j. Integration is semi-implicit. After a
+step, anchors at or below the ground are put on it: their velocity along z becomes zero, and their velocity along the ground is
+multiplied by phi.
 """
-# No postponed annotations here: Warp needs the evaluated types of the closures below.
+# This module does not postpone annotations: Warp needs the evaluated types of the closures below.
 
 import functools
 from dataclasses import dataclass
@@ -29,25 +30,25 @@ from neuspring.physics.arrays import Graphs
 from neuspring.physics.solver import simulate_frame
 
 LINK_COUNT, LINK_REACH = 50, 0.04
-"""A controller is linked to at most so many anchors, as far from it in frame 0, m."""
+"""Maximum number of anchors linked to a controller, and their maximum distance in frame 0, m."""
 SHORTEST_LINK = 1e-4
-"""Rest lengths of controller links are floored here, m: a controller may lie on an anchor."""
+"""Minimum rest length of controller links, m: a controller may be at the position of an anchor."""
 SLACK = 1e-6
 """Elongations below this exert no force, m."""
 MIN_ANCHOR_LENGTH = 1e-6
-"""Lengths are floored here when a direction is formed, m."""
+"""Minimum length in directions, m."""
 PACKED = ("stiffness", "soft", "scalars")
-"""Trained parameters as the kernels take them; scalars are damping and friction."""
+"""Arguments of the kernels with trained parameters; scalars are damping and friction."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorGraph(Artifact):
-    """Graph of the anchors and controllers that each anchor feels. Springs are directed: row i has those that anchor i feels."""
+    """The directed springs and links of each anchor: row i has the springs that pull anchor i."""
 
     kind: ClassVar[str] = "anchor_graph"
     anchors: np.ndarray = array("N,3", np.float32, "m", "positions in frame 0")
     neighbors: np.ndarray = array("N,K", np.int32, "1", "the K nearest other anchors, nearest first")
-    lengths: np.ndarray = array("N,K", np.float32, "m", "their distances in frame 0, the rest lengths")
+    lengths: np.ndarray = array("N,K", np.float32, "m", "rest lengths: distances to the neighbors in frame 0")
     link_starts: np.ndarray = array("L", np.int32, "1", "links of anchor i: link_starts[i] to link_starts[i + 1]")
     links: np.ndarray = array("M", np.int32, "1", "controller of each link")
     link_lengths: np.ndarray = array("M", np.float32, "m", "rest lengths of links")
@@ -57,22 +58,22 @@ class AnchorGraph(Artifact):
         if len(self.link_starts) != anchors + 1:
             raise InputError("spring_gaus.link_starts", f"{anchors + 1} entries are required", len(self.link_starts))
         if self.neighbors.size and not 0 <= self.neighbors.min() <= self.neighbors.max() < anchors:
-            raise InputError("spring_gaus.neighbors", f"indices must lie in [0, {anchors})", int(self.neighbors.max()))
+            raise InputError("spring_gaus.neighbors", f"indices must be in [0, {anchors})", int(self.neighbors.max()))
         if (self.lengths <= 0).any() or (self.link_lengths <= 0).any():
             raise InputError("spring_gaus.lengths", "every rest length must be positive", "0 or less")
 
     @classmethod
     def between(cls, anchors: np.ndarray, controllers: np.ndarray, neighbors: int) -> "AnchorGraph":
-        """The graph of anchors [N, 3] and controllers [C, 3] of frame 0, m.
+        """The graph of anchors [N, 3] and controllers [C, 3] in frame 0, m.
 
-        Raises NumericalFailure if there are too few anchors, or two at one place.
+        Raises NumericalFailure for too few anchors, or if two anchors have the same position.
         """
         if len(anchors) <= neighbors:
-            raise NumericalFailure(f"more anchors than neighbors ({neighbors}) are required, and there are {len(anchors)}")
+            raise NumericalFailure(f"more anchors than neighbors ({neighbors}) are required; received {len(anchors)}")
         tree = cKDTree(anchors)
         distance, index = tree.query(anchors, k=neighbors + 1)
         if distance[:, 1].min() <= 0:
-            raise NumericalFailure(f"two anchors lie at one place: {int(distance[:, 1].argmin())}")
+            raise NumericalFailure(f"anchor {int(distance[:, 1].argmin())} has the position of another anchor")
         link_distance, near = tree.query(controllers, k=min(LINK_COUNT, len(anchors)), distance_upper_bound=LINK_REACH)
         link_distance, near = link_distance.reshape(len(controllers), -1), near.reshape(len(controllers), -1)
         controller, slot = np.nonzero(np.isfinite(link_distance))
@@ -80,7 +81,7 @@ class AnchorGraph(Artifact):
         order = np.lexsort((controller, anchor))
         return AnchorGraph(
             anchors=anchors,
-            # The nearest is the anchor itself: distances of others are positive.
+            # The nearest is the anchor itself, because all other distances are positive.
             neighbors=index[:, 1:],
             lengths=distance[:, 1:],
             link_starts=np.searchsorted(anchor[order], np.arange(len(anchors) + 1)),
@@ -91,38 +92,38 @@ class AnchorGraph(Artifact):
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorPhysics:
-    """Constants of the motion: they are not trained."""
+    """Constants of the motion, which are not trained."""
 
     frame_time: float
-    """s."""
+    """Time per frame, s."""
     exponent: float = 0.5
     """p in (1 + |e|)^p."""
     link_stiffness: float = 3e4
-    """N per unit strain of the controllers' links, at 1 kg."""
+    """Stiffness c of the controllers' links, N per unit strain, at 1 kg."""
     gravity: float = 9.8
-    """m/s^2, against up."""
+    """Downward acceleration, m/s^2."""
     up_sign: float = 1.0
-    """+1 where +z is up, -1 where -z is."""
+    """+1 if +z is up, -1 if -z is up."""
     ground: bool = True
-    """A plane at z = 0."""
+    """Whether the plane z = 0 is the ground."""
 
 
 @dataclass(frozen=True)
 class AnchorParameters:
-    """Trained values in the form that the forces use, at 1 kg per anchor."""
+    """The trained values that forces use, at 1 kg per anchor."""
 
     stiffness: torch.Tensor
-    """[N] s_i, N: 10^kappa."""
+    """Stiffness s_i = 10^kappa [N], N."""
     soft: torch.Tensor
-    """[K] eta, by rank."""
+    """Soft vector eta by rank [K]."""
     damping: torch.Tensor
-    """zeta, N s: divided by a spring's rest length it is the constant of its dashpot."""
+    """zeta, N s; divided by a spring's rest length it is the constant of its dashpot."""
     friction: torch.Tensor
-    """phi: the fraction of the velocity along the ground that remains after each substep on it."""
+    """phi: the fraction of the velocity along the ground that remains after each substep."""
 
 
 class AnchorKernels(NamedTuple):
-    """Kernels and their arguments for one scalar type. Kernels are launched over [N] anchors."""
+    """Kernels over [N] anchors and the types of their arguments, for one scalar type."""
 
     substep: Any
     adjoint: Any
@@ -196,9 +197,9 @@ def kernels(real: Any) -> AnchorKernels:
         speed = state.v[slot, i]
         to = adjoint.x[slot + 1, i]
         by = adjoint.v[slot + 1, i]
-        # Only the ground puts a point at exactly 0.
+        # Only the ground sets a height to exactly 0.
         if model.ground != 0 and state.x[slot + 1, i][2] == zero:
-            # Along the ground the step is x + h u: u is read from the positions, as phi may be 0.
+            # Along the ground the step is x + h u. Positions give u, because phi may be 0.
             u = (state.x[slot + 1, i] - at) / model.substep
             wp.atomic_add(adjoint.scalars, 1, by[0] * u[0] + by[1] * u[1])
             to = vec3(to[0], to[1], zero)
@@ -230,7 +231,7 @@ def kernels(real: Any) -> AnchorKernels:
                 hard += cn * state.soft[r] * unit
                 wp.atomic_add(adjoint.soft, r, cn * state.stiffness[i] * unit)
             damping += cn * closing / rest
-            # The direction turns (c and the relative velocity, without their parts along n), the length stretches the spring.
+            # Gradients of the direction (c and the relative velocity, without their components along n) and of the length.
             g = (c - n * cn) * (pull / length) + (relative - n * closing) * (dashpot * cn / length) + n * (cn * slope)
             w = n * (cn * dashpot)
             wp.atomic_add(adjoint.x, slot, j, g)
@@ -255,7 +256,7 @@ def kernels(real: Any) -> AnchorKernels:
 
 
 class AnchorSolver:
-    """Advances anchors by frames of a fixed number of substeps. The forward and the backward pass are each a captured graph."""
+    """Advances anchors by frames with a fixed number of substeps. The forward and backward passes are captured graphs."""
 
     def __init__(
         self, graph: AnchorGraph, physics: AnchorPhysics, substeps: int, device: str = "cpu", dtype: torch.dtype = torch.float32
@@ -299,7 +300,7 @@ class AnchorSolver:
     def frame(
         self, parameters: AnchorParameters, x: torch.Tensor, v: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(x, v) [N, 3] one frame later, differentiable in x, v and parameters; controllers [C, 3] go from `begin` to `end`."""
+        """(x, v) [N, 3] after one frame, differentiable in x, v and parameters; controllers [C, 3] move from `begin` to `end`."""
         scalars = torch.stack([parameters.damping.reshape(()), parameters.friction.reshape(())])
         packed = {"stiffness": parameters.stiffness, "soft": parameters.soft, "scalars": scalars}
         return simulate_frame(self, packed, x, v, begin, end)
@@ -307,11 +308,11 @@ class AnchorSolver:
     def run(
         self, begin: torch.Tensor, end: torch.Tensor, x: torch.Tensor, v: torch.Tensor, parameters: dict[str, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(x, v) after a frame with parameters as the kernels take them."""
+        """(x, v) after a frame, with the parameters of the kernels (`PACKED`)."""
         b = self._buffers
         for name in PACKED:
             b[name].copy_(parameters[name])
-        # Controllers after the last that holds an anchor do not matter.
+        # Controllers after the last linked controller do not matter.
         b["begin"].copy_(begin[: len(b["begin"])])
         b["end"].copy_(end[: len(b["end"])])
         b["x"][0], b["v"][0] = x, v
@@ -320,7 +321,7 @@ class AnchorSolver:
         return b["x"][-1].clone(), b["v"][-1].clone()
 
     def backward(self, adj_x: torch.Tensor, adj_v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        """Adjoints of the last forward frame: of x, of v, and of parameters by name."""
+        """Adjoints of x, v and the parameters, by name, for the last forward frame."""
         b = self._buffers
         for name in ("x", "v", *PACKED):
             b[f"adj_{name}"].zero_()

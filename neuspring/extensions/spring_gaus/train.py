@@ -1,15 +1,17 @@
-"""Training of Spring-Gaus: each epoch replays the training frames from rest, with an optimizer step per frame.
+"""Training of Spring-Gaus: each epoch replays the training frames from rest, with one optimizer step per frame.
 
-The gradient goes through one frame only. One initial velocity v0 is added on entering every frame and removed on leaving it, as in
-the public code, so a step of the optimizer changes the velocity in the middle of a trajectory. A frame that leaves the scene, or
-whose loss or gradient is not finite, is simulated again with more substeps. Where no more are allowed, training ends as a named
-failure with the parameters of the last complete epoch. The last epoch is the result. The published name of an epoch is iteration.
+- The gradient covers only one frame.
+- An initial velocity v0 is added at the start of every frame and removed at its end, as in the public code. So an optimizer step
+  changes the velocity in the middle of a trajectory.
+- A frame that leaves the scene, or has a loss or gradient that is not finite, is simulated again with more substeps. At the
+  maximum training ends as a failure, with the parameters of the last complete epoch.
+- The result is the last epoch. The paper calls an epoch an iteration.
 
-Silhouettes are white splats on black against the object's mask, in one camera:
+The loss compares the coverage of white splats on black with the object's mask in one camera:
 
     L = 0.2 |A - M| + 0.8 (1 - SSIM(A, M)) + |c(A) - c(M)| / W + 0.1 MSE(VGG16(A), VGG16(M)) + 2 TV(A)
 
-A the drawn coverage, M the mask, c the centroid in pixels, W the picture's width, TV the mean squared difference of neighbors.
+A is the rendered coverage, M the mask, c the centroid in pixels, W the image width, TV the mean squared difference of neighbors.
 """
 
 from __future__ import annotations
@@ -41,48 +43,48 @@ from neuspring.splats.rasterize import choose_backend, rasterize
 from neuspring.twin.losses import FrameLoss
 
 Objective = Callable[[int, int, torch.Tensor], torch.Tensor | None]
-"""(epoch, frame, anchors [N, 3] m at the end of the frame) -> loss; None where there is nothing to compare with."""
+"""(epoch, frame, anchors [N, 3], m, at the end of the frame) -> loss; None for a frame without data."""
 Features = Callable[[torch.Tensor], torch.Tensor]
-"""Pictures [B, 3, H, W] in 0..1 -> features."""
+"""Images [B, 3, H, W] in 0..1 -> features."""
 L1_WEIGHT, DSSIM_WEIGHT, FEATURE_WEIGHT, VARIATION_WEIGHT = 0.2, 0.8, 0.1, 2.0
 """Weights of the terms, as published."""
 LEAST_COVER = 1e-6
-"""Floor of a silhouette's area, px, where a centroid is divided by it."""
+"""Minimum area of a silhouette in its centroid, px."""
 IMAGENET_MEANS, IMAGENET_DEVIATIONS = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, of R, G, B in 0..1."""
+"""Means and standard deviations of ImageNet's R, G, B in 0..1."""
 SOFT_RATE = GROUND_RATE = 1e-3
-"""Adam's learning rates of s, the parameter of the soft weights, and of rho."""
+"""Adam's learning rates of s, the parameter of the soft vector, and of rho."""
 CLIP = 1.0
-"""Largest norm of the gradient of each tensor by itself."""
+"""Maximum gradient norm of each tensor."""
 SPRING_GAUS_ADAM_EPSILON = 1e-15
 SUBSTEPS_ADDED, SUBSTEPS_RAISED = 50, (25, 50)
-"""Substeps that are added at these iterations, and whenever a frame fails."""
+"""Substeps that are added at each of these iterations and after each failed frame."""
 SPRING_GAUS_METRICS = ("loss", "gradient_norm", "substeps")
 
 
 class UnusableFrame(ArithmeticError):
-    """A frame from which nothing can be learned; says why."""
+    """A frame that cannot be used for training, with the reason."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Start, data and loss that a model is trained with."""
+    """Initial model, data and loss of a training."""
 
     start: SpringGausModel
     hands: np.ndarray
-    """[T, C, 3] m, of the training frames."""
+    """Controllers in the training frames [T, C, 3], m."""
     objective: Objective
     settings: SpringGausTraining
     device: str = "cpu"
 
 
 def train(request: TrainingRequest) -> Trained[SpringGausModel]:
-    """Train on silhouettes, or on points. Raises InputError for `supervision: masks` without pictures."""
+    """Train on silhouettes or on points. Raises InputError for `supervision: masks` without images."""
     observations, settings, device = request.observations, request.settings, request.device
     chosen, scenario = SpringGausTraining(**vars(settings.baselines.spring_gaus)), observations.scenario
     pictures = request.pictures if chosen.supervision == "masks" else None
     if chosen.supervision == "masks" and pictures is None:
-        rule = "supervision: masks needs --capture, --masks and --appearance"
+        rule = "supervision: masks requires --capture, --masks and --appearance"
         raise InputError("baselines.spring_gaus.supervision", rule, "none", "Use supervision: points for captures without images.")
     splats = Splats.load(pictures.splats) if pictures else None
     cloud = observations.nodes if splats is None else splats.means
@@ -107,7 +109,7 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
         loss = FrameLoss.of(observations, settings.losses, device)
 
         def objective(epoch: int, frame: int, anchors: torch.Tensor) -> torch.Tensor:
-            """Chamfer and track loss of structure points in displacement form: s_t = s_0 + sum w (a_t - a_0)."""
+            """Chamfer and track loss of structure points, which follow displacements: s_t = s_0 + sum w (a_t - a_0)."""
             return loss(frame, nodes + follower(anchors - rest))
 
     problem = Problem(start, hands, objective, chosen, device)
@@ -119,9 +121,9 @@ def train(request: TrainingRequest) -> Trained[SpringGausModel]:
 def silhouettes(
     pictures: Pictures, splats: Splats, follower: Follower, weights: Path | str, settings: Config, seed: int, device: str
 ) -> Objective:
-    """The loss of the splats, white on black, on the object's mask in one random camera per frame and epoch.
+    """The loss of white splats on black against the object's mask, in one random camera per frame and epoch.
 
-    Masks of future frames are not used.
+    Masks of future frames are not read.
     """
     capture, images = Capture.load(pictures.folder), settings.images
     masks = {
@@ -138,7 +140,7 @@ def silhouettes(
         cameras = [name for name in views if (name, frame) in masks]
         if not cameras:
             return None
-        # Stateless, so that a continued training draws the same cameras.
+        # The generator depends only on seed, epoch and frame, so that a resumed training draws the same cameras.
         name = cameras[int(np.random.default_rng([seed, epoch, frame]).integers(len(cameras)))]
         means = follower(anchors)
         white = torch.ones_like(means)
@@ -149,12 +151,12 @@ def silhouettes(
 
 
 def run(problem: Problem, partial: Path | None = None, key: str = "") -> Trained[SpringGausModel]:
-    """Train; continue from `partial` if it holds a checkpoint with the same key."""
+    """Train; resumes if `partial` contains a checkpoint with the same key."""
     return run_epochs(SpringGausTrainer(problem), SPRING_GAUS_METRICS, problem.settings.iterations, partial, key)
 
 
 class SpringGausTrainer:
-    """Runs epochs, a frame at a time."""
+    """Runs epochs, one frame at a time."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem, settings = problem, problem.settings
@@ -175,12 +177,12 @@ class SpringGausTrainer:
         self.keep()
 
     def use_substeps(self, count: int) -> None:
-        """Integrate with `count` substeps per frame from now on."""
+        """Set the number of substeps per frame."""
         model = self.problem.start
         self.substeps, self.solver = count, AnchorSolver(model, model, count, self.problem.device)
 
     def add_substeps(self) -> bool:
-        """Take more substeps per frame; False if no more are allowed."""
+        """Increase the number of substeps per frame; False at the maximum."""
         more = min(self.substeps + SUBSTEPS_ADDED, self.problem.settings.max_substeps)
         if more == self.substeps:
             return False
@@ -188,7 +190,7 @@ class SpringGausTrainer:
         return True
 
     def epoch(self, number: int) -> dict[str, float]:
-        """One pass over the frames. Raises TrainingStopped where a frame fails with the most substeps."""
+        """Run one pass over the frames. Raises TrainingStopped if a frame fails with the maximum number of substeps."""
         if number in SUBSTEPS_RAISED:
             self.add_substeps()
         x, v = self.rest, torch.zeros_like(self.rest)
@@ -202,7 +204,7 @@ class SpringGausTrainer:
                 except UnusableFrame as fault:
                     if not self.add_substeps():
                         raise TrainingStopped(f"{fault} (iteration {number}, frame {frame}, {self.substeps} substeps)") from fault
-                    print(f"iteration {number}, frame {frame}: {fault}; {self.substeps} substeps from here on", flush=True)
+                    print(f"iteration {number}, frame {frame}: {fault}; {self.substeps} substeps from now on", flush=True)
             x, v, loss, norm = after
             if loss is not None:
                 losses.append(loss)
@@ -215,12 +217,12 @@ class SpringGausTrainer:
     ) -> tuple[torch.Tensor, torch.Tensor, float | None, float]:
         """Simulate a frame and make an optimizer step.
 
-        Returns the state after it, its loss, and the largest gradient norm of any tensor before clipping. Raises UnusableFrame.
+        Returns positions, velocities, loss, and the largest gradient norm of any tensor before clipping. Raises UnusableFrame.
         """
         parameters = self.problem.start.parameters(self.values)
         ends = self.hands[frame - 1], self.hands[frame]
         after, speed = self.solver.frame(parameters, x, v + self.values["velocity"], *ends)
-        # NaN compares false, so this catches it together with infinity and absurd distances.
+        # NaN compares as false, so this condition catches NaN, infinity and absurd distances.
         if not bool((after.detach().abs() < DIVERGENCE_RADIUS).all() and torch.isfinite(speed.detach()).all()):
             raise UnusableFrame("the anchors left the scene")
         state = after.detach(), (speed - self.values["velocity"]).detach()
@@ -235,13 +237,13 @@ class SpringGausTrainer:
         for tensor in tensors:
             torch.nn.utils.clip_grad_norm_([tensor], CLIP)
         self.optimizer.step()
-        # Clamping in the forces alone would leave a negative damping without a gradient, stuck for good.
+        # If only the forces clamped the damping, a negative value would never get a gradient again.
         with torch.no_grad():
             self.values["theta"].clamp_(min=1.0)
         return *state, float(loss.detach()), float(norms.max())
 
     def keep(self) -> None:
-        """Remember the present values as those of the last complete epoch."""
+        """Keep the current values as those of the last complete epoch."""
         self.complete = {name: tensor.detach().clone() for name, tensor in self.values.items()}
 
     def model(self) -> SpringGausModel:
@@ -254,7 +256,7 @@ class SpringGausTrainer:
         return {"iterations": epochs, "substeps": self.substeps}
 
     def checkpoint(self) -> Checkpoint:
-        """Everything that a continued training needs."""
+        """The state from which training resumes."""
         values = {name: tensor.detach().cpu().numpy() for name, tensor in self.values.items()}
         return Checkpoint({"values": values, "adam": adam_arrays(self.optimizer)}, {"substeps": self.substeps})
 
@@ -269,14 +271,14 @@ class SpringGausTrainer:
 
 
 def silhouette_loss(drawn: torch.Tensor, mask: torch.Tensor, features: Features | None) -> torch.Tensor:
-    """Loss of a drawn coverage [H, W] against a mask [H, W], both in 0..1; without features their term is left out."""
+    """Loss of a rendered coverage [H, W] against a mask [H, W], both in 0..1; without features their term is omitted."""
     total = L1_WEIGHT * (drawn - mask).abs().mean()
     total = total + DSSIM_WEIGHT * (1 - ssim(drawn[None], mask[None]))
     if bool(mask.any()):
         total = total + (centroid(drawn) - centroid(mask)).norm() / drawn.shape[1]
     if features is not None:
-        found, wanted = (features(picture.expand(1, 3, -1, -1)) for picture in (drawn, mask))
-        total = total + FEATURE_WEIGHT * (found - wanted.detach()).square().mean()
+        rendered, target = (features(image.expand(1, 3, -1, -1)) for image in (drawn, mask))
+        total = total + FEATURE_WEIGHT * (rendered - target.detach()).square().mean()
     return total + VARIATION_WEIGHT * total_variation(drawn)
 
 
@@ -289,7 +291,7 @@ def centroid(silhouette: torch.Tensor) -> torch.Tensor:
 
 
 def total_variation(picture: torch.Tensor) -> torch.Tensor:
-    """Mean squared difference of vertical neighbors plus that of horizontal ones, of a picture [H, W]."""
+    """Mean squared difference of vertical neighbors of an image [H, W], plus that of horizontal neighbors."""
     return (picture[1:] - picture[:-1]).square().mean() + (picture[:, 1:] - picture[:, :-1]).square().mean()
 
 
@@ -302,12 +304,12 @@ def vgg16() -> Sequential:
 
 
 def load_features(path: Path, device: str) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Pictures [B, 3, H, W] in 0..1 -> features [B, 128, H / 2, W / 2], differentiably. Raises InputError for a damaged file."""
+    """Images [B, 3, H, W] in 0..1 -> features [B, 128, H / 2, W / 2], differentiable. Raises InputError for a damaged file."""
     layers = read_layers(path, vgg16, device)
 
     def features(pictures: torch.Tensor) -> torch.Tensor:
         mean, deviation = (pictures.new_tensor(values)[:, None, None] for values in (IMAGENET_MEANS, IMAGENET_DEVIATIONS))
-        found: torch.Tensor = layers((pictures - mean) / deviation)
-        return found
+        result: torch.Tensor = layers((pictures - mean) / deviation)
+        return result
 
     return features

@@ -19,7 +19,7 @@ from neuspring.stages.stage import Written, paths, stage
 def judge(
     capture: Capture, masks: Sequence[Before], tracks: Sequence[Before], lifted: Before, settings: Config, run: Recorder
 ) -> Written:
-    """Measure the perception of a synthetic capture against the truth; the errors are facts of the record."""
+    """Perception of a synthetic capture -> its errors against the truth, as facts of the record."""
     from neuspring.data.results import LiftedTracks, masks_of_cameras, tracks_of_cameras
     from neuspring.extensions.synthetic import errors as errors_of
     from neuspring.extensions.synthetic.truth import truth_of

@@ -1,4 +1,4 @@
-"""The commands of a sweep: a worker (tune) and the report (tune-report)."""
+"""The commands of a sweep: a worker (`tune`) and the report (`tune-report`)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def tune(
     device: Device = "auto",
     threads: int = 1,
 ) -> None:
-    """One worker of a sweep."""
+    """Run one worker of a sweep."""
     from neuspring.extensions.tuning.worker import work
 
     work(*_sweep(settings), list(observations), worker, device, output)
 
 
 def tune_report(output: Path, settings: Settings = "{}") -> None:
-    """A sweep -> summary, table, best.yaml."""
+    """Summarize a sweep: summary, table of trials, best.yaml."""
     from neuspring.extensions.tuning.report import report
 
     report(*_sweep(settings), output)
@@ -38,5 +38,5 @@ def tune_report(output: Path, settings: Settings = "{}") -> None:
 def _sweep(text: str) -> tuple[Config, Tune]:
     settings = read_settings(text)
     if settings.tune is None:
-        raise InputError("--settings, tune", "a sweep is required", None, "See config/README.md, tune.")
+        raise InputError("--settings, tune", "a sweep is required", None, "Set tune as in config/README.md.")
     return settings, settings.tune

@@ -1,7 +1,7 @@
 """The space of a sweep: settings of one method and of its search, checked before the first trial.
 
-A trial overrides settings of the configuration that has the method's row and its search row applied. Nothing heavy is imported: the
-workflow makes a plan before any job exists.
+A trial overrides settings of the configuration, after those of the method and its search. This module imports nothing heavy,
+because the workflow makes a plan before any job exists.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neuspring.experiments.benchmark import read_methods, read_searches, with_me
 from neuspring.twin.body import BODIES
 
 SECTIONS = ("simulation", "losses", "search", "fit", "released_quirks")
-"""Sections that a trial reads; observations are made before."""
+"""Sections that a sweep can vary; observations are made before."""
 SWEEP_SEED = 0
-"""Seed of search and field, the same in all trials, so that they differ by their settings alone."""
+"""Seed of search and field. All trials share it, so that they differ only in their settings."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep with everything that it refers to."""
+    """A sweep with its method, search and settings."""
 
     tune: Tune
     method: Method
@@ -40,17 +40,17 @@ class Plan:
 
     @classmethod
     def of(cls, settings: Config, tune: Tune, root: Path = Path()) -> Plan:
-        """Check a sweep as far as that needs no data. Tables are read relative to `root`. Raises InputError."""
+        """Check a sweep without its data. Tables are read relative to `root`. Raises InputError."""
         extra = [root / path for path in settings.extra_rows.values()]
         methods = read_methods(root / settings.method_table, extra)
         searches = read_searches(root / settings.search_table, settings.clusters, extra)
         method = methods.get(tune.method)
         row = searches.get(method.search) if method and method.search else None
         if method is None or row is None or method.oracle or not BODIES[row.body].by_gradients:
-            rule = f"a method of {settings.method_table} is required that has a search, is fitted by gradients and is no oracle"
+            rule = f"must be a method of {settings.method_table} with a search and a gradient fit, and not an oracle"
             raise InputError("tune.method", rule, tune.method)
-        own = with_search(with_method(settings, method, tune.method), row, method.search or "")
-        base = {name: config.plain(getattr(own, name)) for name in SECTIONS} | {"clusters": row.clusters}
+        unchanged = with_search(with_method(settings, method, tune.method), row, method.search or "")
+        base = {name: config.plain(getattr(unchanged, name)) for name in SECTIONS} | {"clusters": row.clusters}
         plan = cls(tune, method, row, base)
         for name, dimension in tune.space.items():
             if (section := name.partition(".")[0]) not in (*SECTIONS, "clusters"):
@@ -61,12 +61,12 @@ class Plan:
         return plan
 
     def at(self, values: Mapping[str, Any], where: str) -> tuple[Config, int]:
-        """The settings (`SECTIONS` of a configuration) and number of regions of a trial. Raises InputError."""
+        """The settings (`SECTIONS` of a configuration) and the number of regions of a trial. Raises InputError."""
         changed = copy.deepcopy(self.base)
         for name, value in values.items():
             section, key = section_of(changed, name)
             if not isinstance(section, dict) or isinstance(section.get(key), dict):
-                raise InputError(where, "one setting is required, not a section or a part of a setting")
+                raise InputError(where, "must be one setting, not a section or an item of a setting")
             section[key] = value
         clusters = changed.pop("clusters")
         settings = config.parse(Config, changed, where)
@@ -76,16 +76,16 @@ class Plan:
             rule = f"fit.stiffness_range must contain search.variables.stiffness, {searched.low} to {searched.high}"
             raise InputError(where, rule, [low, high])
         if not isinstance(clusters, int) or clusters < 1:
-            raise InputError(where, "clusters must be a whole number, at least 1", clusters)
+            raise InputError(where, "clusters must be an integer, at least 1", clusters)
         return settings, clusters
 
     @property
     def baseline(self) -> dict[str, Any]:
-        """The varied settings as they are in the unchanged configuration."""
+        """The values of the varied settings in the unchanged configuration."""
         return {name: functools.reduce(lambda inside, part: inside[part], name.split("."), self.base) for name in self.tune.space}
 
     def facts(self) -> dict[str, Any]:
-        """Facts that must not change while a sweep lasts, as plain values."""
+        """Facts that must not change during a sweep, as plain values."""
         space = {name: config.plain(dimension) for name, dimension in self.tune.space.items()}
         return {"method": self.tune.method, "fit": self.method.fit, "base": self.base, "space": space, "seed": SWEEP_SEED}
 
@@ -93,12 +93,12 @@ class Plan:
         weights = [f"losses.{term.name}" for term in dataclasses.fields(config.Losses) if term.name != "acceleration"]
         fit, value, choices = self.method.fit, self.baseline[name], dimension.choices
         faults = {
-            # The acceleration term guides the search alone; the objective is the loss of a fit.
-            "must be the same in all trials, whose losses are measured with it": name
+            # The weight of acceleration affects only the search; the objective of a trial is the loss of a fit.
+            "must be the same in all trials, because it defines their objective": name
             in (*weights, "fit.selection", "released_quirks.frozen_loss_denominators"),
-            f"method {self.tune.method} does not read it": (name.startswith("fit.") and not fit)
+            f"must be a setting that method {self.tune.method} reads": (name.startswith("fit.") and not fit)
             or (name.startswith("fit.field.") and fit != "field"),
-            "choices must be numbers, words, true, false or null": any(isinstance(one, list | dict) for one in choices),
+            "choices must be numbers, words, true, false or null": any(isinstance(choice, list | dict) for choice in choices),
             f"its values must include that of the method, {value}": not contains(dimension, value),
         }
         for rule, broken in faults.items():
@@ -107,13 +107,13 @@ class Plan:
 
 
 def section_of(sections: dict[str, Any], name: str) -> tuple[Any, str]:
-    """The section of a dotted name, which is made where there is none, and the name of the setting in it."""
+    """The section of a dotted name, which is added if it is missing, and the name of the setting in it."""
     *path, key = name.split(".")
     return functools.reduce(lambda inside, part: inside.setdefault(part, {}), path, sections), key
 
 
 def contains(dimension: Dimension, value: Any) -> bool:
-    """True where a dimension has a value, steps left out: Optuna refuses a value between two steps."""
+    """Whether a dimension contains a value; steps do not matter."""
     if dimension.choices or isinstance(value, bool) or not isinstance(value, int | float):
         return value in dimension.choices
     assert dimension.low is not None

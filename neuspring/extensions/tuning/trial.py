@@ -1,7 +1,7 @@
-"""One trial of a sweep: search and fit with its settings, judged by a tail of the training frames, which neither has seen.
+"""One trial of a sweep: search and fit with its settings, and the loss over the tail of the training frames.
 
-Search and fit see the frames before the tail. The value of a trial is the loss over the tail of the twin that it selects
-(`fit.selection: tail`), averaged over scenarios. Frames after the training frames are removed before anything is computed.
+Search and fit use the frames before the tail. The trial selects a twin with `fit.selection: tail`; its value is the twin's loss
+over the tail, averaged over scenarios. Future frames are removed before anything is computed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from neuspring.twin.fit import FitProblem, NonFinite, fit, start_loss, tail_star
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """A scenario's training frames, and the file of those before its tail."""
+    """A scenario's training frames, and the file of the frames before its tail."""
 
     name: str
     training: Observations
@@ -38,11 +38,11 @@ class TrainingScene:
 
     @classmethod
     def of(cls, path: Path, folder: Path) -> TrainingScene:
-        """Read observations; the frames before the tail are written to `folder`. Raises InputError."""
+        """Read observations and write the frames before the tail to `folder`. Raises InputError."""
         observations = Observations.load(path)
         scenario = observations.scenario
         if scenario.train_end < 3:
-            rule = "a tail needs at least two training frames after frame 0"
+            rule = "a sweep needs at least two training frames after frame 0"
             raise InputError(f"scenario {scenario.name}", rule, scenario.train_end - 1)
         target = folder / f"{scenario.name}.npz"
         cut(observations, tail_start(scenario.train_end)).save(target)
@@ -56,19 +56,19 @@ class TrainingScene:
 
 
 def cut(observations: Observations, end: int) -> Observations:
-    """The first `end` frames, all for training, without annotated tracks, which are for scoring."""
+    """The first `end` frames, all for training. Annotated tracks are removed, because only scores use them."""
     timed = [spec.name for spec in dataclasses.fields(Observations) if spec.metadata.get("shape", ("",))[0] == "T"]
     arrays = {name: getattr(observations, name)[:end] for name in timed}
     arrays["tracks"] = arrays["tracks"][:, :0]
-    # The reader's notes, such as digests of files, depend on later frames.
+    # Provenance, such as digests of files, depends on later frames.
     return replace(observations, scenario=replace(observations.scenario, frame_count=end, train_end=end, provenance={}), **arrays)
 
 
 def value_of(trial: optuna.Trial, plan: Plan, scenes: Sequence[TrainingScene], folder: Path, device: str) -> float:
-    """Search and fit every scenario with a trial's values; the mean loss of their tails, m^2.
+    """Search and fit every scenario with a trial's values; returns the mean loss of their tails, m^2.
 
-    Reports the loss of every epoch to Optuna, or with several scenarios that of each one. `folder` is the sweep's; trials share the
-    searches in it. Raises TrialPruned, NumericalFailure, and InputError for settings that exclude each other.
+    With one scenario, the loss of every epoch is reported to Optuna; with several, the loss of every scenario. Trials share the
+    searches in `folder`, the folder of the sweep. Raises TrialPruned, NumericalFailure, and InputError for settings in conflict.
     """
     settings, clusters = plan.at({name: suggest(trial, name, plan) for name in plan.tune.space}, f"trial {trial.number}")
     losses = list[float]()
@@ -120,7 +120,7 @@ def suggest(trial: optuna.Trial, name: str, plan: Plan) -> Any:
 
 
 def searched(scene: TrainingScene, settings: Config, clusters: int, device: str, folder: Path) -> Path:
-    """The record of a search on the frames before the tail. The first trial that needs the search makes it."""
+    """The record of a search on the frames before the tail; the first trial that needs the search runs it."""
     values = {name: config.plain(getattr(settings, name)) for name in ("search", "simulation", "losses", "released_quirks")}
     facts = [scene.name, digest_file(scene.head), values, clusters, device.partition(":")[0], code_digest("neuspring.twin.search")]
     record = folder / f"search-{hashlib.sha256(canonical(facts).encode()).hexdigest()[:16]}" / "search.json"

@@ -1,18 +1,18 @@
-"""A silicone beam under known loads: twins from the ring-down of the unloaded beam, and the pose of its loaded tip predicted.
+"""A silicone beam under known loads: twins are fitted to the ring-down of the unloaded beam and predict the pose of the loaded tip.
 
     python -m results.published.beam.make FOLDER OUTPUT
 
 FOLDER has C3D files whose names end in gravity_V2_NAME.c3d (unloaded) or load<grams>_V2_NAME.c3d, with markers `Tip - ...`. A hand
-holds the beam, lets go, and it rings and comes to rest. Only unloaded files are fitted to:
+holds the beam and releases it; the beam oscillates and comes to rest. Only unloaded files are used for fits:
 
-1. **The law.** z'' = -k (z + sum_i s_i (z - q_i)), q_i' = (z - q_i) / T_i, from the held state, is fitted to the heights of the tip
-   of all files together: a linear viscoelastic solid with one branch per factor of 5 in time, from the inverse of the ringing's
-   angular frequency to half of the recording. It gives sqrt(k) / 2 pi, at which a beam of the relaxed modulus would ring.
-2. **The modulus.** That of the twin, at which its first frequency is that one. The force of the hand is in neither.
-3. **The hand.** The twin's static pose under its weight less the observed change is the pose in which the hand held the tip.
+1. **Law.** z'' = -k (z + sum_i s_i (z - q_i)), q_i' = (z - q_i) / T_i, from the held state, is fitted to the tip heights of all
+   files together. It is a linear viscoelastic solid with one branch per factor of 5 in time, from the inverse angular frequency
+   of the oscillation to half of the recording. The result is sqrt(k) / 2 pi, the frequency of a beam with the relaxed modulus.
+2. **Modulus.** The twin gets the modulus at which its first frequency equals this one. The force of the hand is not needed.
+3. **Hand.** The twin's static pose under its weight, minus the observed change, is the pose in which the hand held the tip.
 
-Predicted: the static pose under weight and load less the pose in which the hand held the unloaded tip; the markers turn with
-the tip. The frequency under load is that of the twin with the load, raised by the law. `static` in place of a twin is the usual
+The prediction is the static pose under weight and load, minus the pose in which the hand held the unloaded tip; the markers rotate
+with the tip. The frequency under load is that of the loaded twin, raised by the law. `static` in place of a twin is the usual
 way: a lattice whose modulus explains the unloaded drop as if the hand held it without stress.
 
 The twins are a lattice of nodes 5 mm apart (7.5 across in `lattice_coarse`), and a rod. Mass is the volume by 1070 kg/m^3, the load
@@ -51,18 +51,18 @@ LENGTH, WIDTH, DENSITY, GRAVITY = 0.1, 0.03, 1070.0, 9.81
 """m, m, kg/m^3, m/s^2."""
 MASS = DENSITY * LENGTH * WIDTH**2
 AXES = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
-"""Ours (along the beam, across, up) of theirs (up, across, along)."""
+"""Rotation from the axes of the data (up, across, along) to ours (along the beam, across, up)."""
 FELL = 0.0005
-"""The beam is released when its tip is so far below where it was held, m."""
+"""Fall of the tip that counts as the release, m."""
 BEFORE, LAST = 3, 50
-"""Frames before the release that are not still, and frames at the end over which the pose at rest is averaged."""
+"""Frames before the release that are excluded because the beam moves; last frames that are averaged for the pose at rest."""
 BRANCHES = np.array([0.02, 0.1, 0.5, 2.5])
-"""T_i, s."""
+"""T_i: time constants of the branches, s."""
 REACH = 1.5
-"""Springs join nodes nearer than this, in spacings: 18 neighbors, six along the axes and twelve across squares."""
+"""Largest spring length in spacings: 18 neighbors, six along the axes and twelve along face diagonals."""
 CONTACTS = {"ground_elasticity": 0.0, "ground_friction": 0.0, "contact_elasticity": 0.0, "contact_friction": 0.0}
 WEAK = 1e-2
-"""Part of gravity under which a frequency is measured: small swings about a straight beam."""
+"""Fraction of gravity for frequencies: small oscillations about a straight beam."""
 ACROSS = {"lattice": 6, "lattice_coarse": 4}
 """Nodes across of each lattice."""
 VERTICES = 21
@@ -70,7 +70,7 @@ VERTICES = 21
 
 @dataclass(frozen=True)
 class Recording:
-    """A beam that is let go: markers of its tip [T, 3, 3], m, x along the beam and z up."""
+    """A released beam: markers of its tip [T, 3, 3], m, x along the beam and z up."""
 
     take: str
     load: float
@@ -86,25 +86,25 @@ class Recording:
         own = [k for k, label in enumerate(markers.labels) if label.startswith("Tip")]
         tip = markers.points[:, own].reshape(len(markers.points), -1)
         if lost := int(np.isnan(tip).sum() / 3):
-            print(f"{path.name}: {lost} places of markers are lost, and lie on the line between those before and after")
+            print(f"{path.name}: {lost} missing marker positions are interpolated linearly.")
             tip = pd.DataFrame(tip).interpolate(limit_direction="both").to_numpy()
         return cls(found["take"], float(found["grams"] or 0) / 1e3, tip.reshape(len(tip), -1, 3) @ AXES.T, markers.rate)
 
     @property
     def height(self) -> np.ndarray:
-        """Mean height of the markers over that at rest [T], m."""
+        """Mean height of the markers above rest [T], m."""
         z = self.tip[:, :, 2].mean(axis=1)
         return np.asarray(z - z[-LAST:].mean())
 
     @property
     def released(self) -> int:
-        """The first frame in which the tip falls."""
+        """First frame in which the tip falls."""
         z = self.height
         return int(np.argmax(z < np.median(z[:20]) - FELL))
 
     @property
     def start(self) -> np.ndarray:
-        """Markers in the hand [3, 3], m."""
+        """Markers while the hand holds the beam [3, 3], m."""
         return np.asarray(self.tip[self.released // 2 : self.released - BEFORE].mean(axis=0))
 
     @property
@@ -114,7 +114,7 @@ class Recording:
 
     @property
     def change(self) -> np.ndarray:
-        """Of the tip's pose from hand to rest: along, up, m, and turn about the horizontal across, rad, down positive."""
+        """Change of the tip's pose from hand to rest: along, up [m], rotation about the cross axis [rad], down positive."""
         start, end = self.start - self.start.mean(axis=0), self.end - self.end.mean(axis=0)
         turn = Rotation.align_vectors(end, start)[0].as_rotvec()[1]
         return np.append((self.end - self.start).mean(axis=0)[[0, 2]], turn)
@@ -122,7 +122,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Law:
-    """Relaxation of the material: branches of s_i times the relaxed stiffness."""
+    """Relaxation of the material: branches with s_i times the relaxed stiffness."""
 
     relaxed: float
     """Hz"""
@@ -131,19 +131,19 @@ class Law:
     """m, RMS"""
 
     def complex(self, frequency: float) -> complex:
-        """Stiffness at a frequency, Hz, over the relaxed one."""
+        """Complex stiffness at a frequency [Hz] over the relaxed stiffness."""
         w = 2j * np.pi * frequency * BRANCHES
         return complex(1 + (self.shares * w / (1 + w)).sum())
 
     def rings(self, relaxed: float) -> tuple[float, float]:
-        """Frequency, Hz, and logarithmic decrement of a body that would ring at `relaxed` with the relaxed stiffness."""
+        """Frequency [Hz] and logarithmic decrement of an object whose frequency is `relaxed` with the relaxed stiffness."""
         found = brentq(lambda f: f**2 - relaxed**2 * self.complex(f).real, relaxed, 2 * relaxed)
         stiffness = self.complex(found)
         return float(found), float(np.pi * stiffness.imag / stiffness.real)
 
 
 def motion(stiffness: float, shares: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """z [T] at times [T], s, since a release from z = 1, where it was at rest for long; 1 before."""
+    """z [T] at times [T] [s] after a release from equilibrium at z = 1; 1 before the release."""
     count = len(shares)
     matrix = np.zeros((2 + count, 2 + count))
     matrix[0, 1], matrix[1, 0], matrix[1, 2:] = 1.0, -stiffness * (1 + shares.sum()), stiffness * shares
@@ -156,17 +156,19 @@ def motion(stiffness: float, shares: np.ndarray, times: np.ndarray) -> np.ndarra
 
 
 def fit_law(recordings: Sequence[Recording]) -> Law:
-    """Least squares over all heights since the release; a recording has its own time of release, held height and final height."""
+    """Least squares over all heights after the release; each recording has its own release time, held height and final height."""
     count = len(BRANCHES)
 
     def residuals(p: np.ndarray) -> np.ndarray:
         rows = []
-        for one, (late, held, rest) in zip(recordings, p[1 + count :].reshape(-1, 3), strict=True):
-            times = np.arange(-1, len(one.height) - one.released) / one.rate - late
-            rows.append(held * motion(np.exp(p[0]), np.exp(p[1 : 1 + count]), times) + rest - one.height[one.released - 1 :])
+        for recording, (late, held, rest) in zip(recordings, p[1 + count :].reshape(-1, 3), strict=True):
+            times = np.arange(-1, len(recording.height) - recording.released) / recording.rate - late
+            rows.append(
+                held * motion(np.exp(p[0]), np.exp(p[1 : 1 + count]), times) + rest - recording.height[recording.released - 1 :]
+            )
         return np.concatenate(rows)
 
-    own = [value for one in recordings for value in (-1 / one.rate, one.height[one.released - BEFORE], 0.0)]
+    own = [value for recording in recordings for value in (-1 / recording.rate, recording.height[recording.released - BEFORE], 0.0)]
     start = np.concatenate([[2 * np.log(2 * np.pi * _ringing(recordings[0])[0])], np.log(np.full(count, 0.05)), own])
     scale = np.concatenate([np.full(1 + count, 0.1), np.tile([1e-3, 1e-4, 1e-4], len(recordings))])
     found = least_squares(residuals, start, x_scale=scale)
@@ -174,15 +176,15 @@ def fit_law(recordings: Sequence[Recording]) -> Law:
     return Law(float(np.exp(found.x[0] / 2) / (2 * np.pi)), np.exp(found.x[1 : 1 + count]), residual)
 
 
-def _ringing(one: Recording, skip: int = 15, frames: int = 150) -> tuple[float, float]:
-    """Frequency, Hz, and logarithmic decrement: a damped cosine on a logarithmic drift, by least squares."""
-    z = one.height[one.released + skip :][:frames]
-    times = (np.arange(len(z)) + skip + 1) / one.rate
+def _ringing(recording: Recording, skip: int = 15, frames: int = 150) -> tuple[float, float]:
+    """Frequency [Hz] and logarithmic decrement: a damped cosine on a logarithmic drift, by least squares."""
+    z = recording.height[recording.released + skip :][:frames]
+    times = (np.arange(len(z)) + skip + 1) / recording.rate
     return ring(z, times, np.log(times))
 
 
 def ring(z: np.ndarray, times: np.ndarray, *drift: np.ndarray) -> tuple[float, float]:
-    """The same of heights z [T] at times [T], s, with a constant and terms of a drift."""
+    """Frequency [Hz] and logarithmic decrement of heights z [T] at times [T] [s], with a constant and drift terms."""
     spectrum = np.abs(np.fft.rfft((z - z.mean()) * np.hanning(len(z)), 16 * len(z)))
     first = np.fft.rfftfreq(16 * len(z), times[1] - times[0])[spectrum.argmax()]
 
@@ -196,9 +198,9 @@ def ring(z: np.ndarray, times: np.ndarray, *drift: np.ndarray) -> tuple[float, f
 
 
 def lattice(across: int, load: float, modulus: float = 1e5) -> Twin:
-    """A block of nodes whose springs are alike, with this modulus along it, Pa (`statics.young`); its controllers are in the clamp.
+    """A block of nodes with equal springs and this modulus along it [Pa] (`statics.young`); its controllers are in the clamp.
 
-    A node stands for the material around it, so the last layer along the beam has half of it, and the load.
+    A node represents the material around it, so the last layer along the beam has half of the mass, and the load.
     """
     spacing = WIDTH / across
     along = np.linspace(0.0, LENGTH, round(LENGTH / spacing) + 1)
@@ -221,15 +223,15 @@ def lattice(across: int, load: float, modulus: float = 1e5) -> Twin:
 
 
 class Beam(ABC):
-    """A kind of twin of the beam, per pascal of its modulus."""
+    """A kind of twin of the beam."""
 
     @abstractmethod
     def static(self, modulus: float, load: float) -> np.ndarray:
-        """Change of the tip's pose from the unloaded shape, as `Recording.change`."""
+        """Change of the tip's pose from the undeformed shape, like `Recording.change`."""
 
     @abstractmethod
     def frequency(self, load: float) -> float:
-        """First frequency at 1e5 Pa, Hz; it goes with the root of the modulus."""
+        """First frequency at 1e5 Pa [Hz]; it is proportional to the square root of the modulus."""
 
 
 class LatticeBeam(Beam):
@@ -255,7 +257,7 @@ class LatticeBeam(Beam):
 
 
 class RodBeam(Beam):
-    """The elastic rod: neither shear nor inertia of turning sections. A clamp holds the middle of its edge."""
+    """The elastic rod, without shear and rotational inertia of sections. The clamp holds the middle of its edge."""
 
     def _rod(self, modulus: float, load: float) -> Rod:
         edge = LENGTH / (VERTICES - 1.5)
@@ -289,7 +291,7 @@ class RodBeam(Beam):
         return solver, x
 
     def static(self, modulus: float, load: float) -> np.ndarray:
-        # Backward Euler from rest with a long step goes a step of Newton towards the equilibrium.
+        # A long step of backward Euler from rest is a Newton step towards the equilibrium.
         simulation = Simulation(frame_time=0.1, substeps=1, gravity=GRAVITY, ground=False)
         solver, x = self._solver(modulus, load, simulation)
         for _ in range(100):
@@ -314,52 +316,56 @@ KINDS: dict[str, Beam] = {**{name: LatticeBeam(across) for name, across in ACROS
 
 
 def predictor(beam: Beam, modulus: float, hand: np.ndarray) -> Callable[[Recording], np.ndarray]:
-    """Where the markers of a recording come to rest [3, 3], m, from where they were held in the pose `hand`."""
+    """Predictor of the markers at rest [3, 3], m, of a recording whose tip was held in the pose `hand`."""
 
-    def predict(one: Recording) -> np.ndarray:
-        along, up, turn = beam.static(modulus, one.load) - hand
-        center = one.start.mean(axis=0)
-        turned = Rotation.from_rotvec([0.0, turn, 0.0]).apply(one.start - center)
+    def predict(recording: Recording) -> np.ndarray:
+        along, up, turn = beam.static(modulus, recording.load) - hand
+        center = recording.start.mean(axis=0)
+        turned = Rotation.from_rotvec([0.0, turn, 0.0]).apply(recording.start - center)
         return np.asarray(center + turned + [along, 0.0, up])
 
     return predict
 
 
-def measured(one: Recording, twin: str, modulus: float, end: np.ndarray, rings: tuple[float, float]) -> dict[str, object]:
-    """A row of the table: observed and predicted."""
-    drops = [float((one.start - pose)[:, 2].mean()) for pose in (one.end, end)]
-    seen = _ringing(one)
-    row = {"twin": twin, "load": one.load, "take": one.take, "modulus": modulus, "drop": drops[0], "predicted": drops[1]}
-    row |= {"error": drops[1] / drops[0] - 1, "markers": float(np.linalg.norm(end - one.end, axis=1).mean())}
+def measured(recording: Recording, twin: str, modulus: float, end: np.ndarray, rings: tuple[float, float]) -> dict[str, object]:
+    """A row of the table, with observed and predicted values."""
+    drop = [float((recording.start - pose)[:, 2].mean()) for pose in (recording.end, end)]
+    seen = _ringing(recording)
+    row = {"twin": twin, "load": recording.load, "take": recording.take, "modulus": modulus, "drop": drop[0], "predicted": drop[1]}
+    row |= {"error": drop[1] / drop[0] - 1, "markers": float(np.linalg.norm(end - recording.end, axis=1).mean())}
     return row | {"frequency": seen[0], "rings": rings[0], "decrement": seen[1], "fades": rings[1]}
 
 
 def main() -> None:
-    """Fit to the unloaded files of a folder, predict all."""
+    """Fit to the unloaded files of a folder and predict all files."""
     parser = ArgumentParser(description=__doc__.split("\n")[0])  # type: ignore[union-attr]
     parser.add_argument("folder", type=Path)
     parser.add_argument("output", type=Path)
     given = parser.parse_args()
     paths = sorted(path for path in given.folder.glob("*.c3d") if NAME.search(path.name))
     recordings = [Recording.read(path) for path in paths]
-    plain = [one for one in recordings if not one.load]
+    plain = [recording for recording in recordings if not recording.load]
     if not plain:
-        raise InputError(given.folder, "a file *gravity_V2_*.c3d is required", [path.name for path in paths])
+        raise InputError(given.folder, "must contain a file *gravity_V2_*.c3d", [path.name for path in paths])
     law = fit_law(plain)
-    laws = {"all": law} | {one.take: fit_law([one]) for one in plain}
-    observed = np.mean([one.change for one in plain], axis=0)
+    laws = {"all": law} | {recording.take: fit_law([recording]) for recording in plain}
+    observed = np.mean([recording.change for recording in plain], axis=0)
     rows = []
     for name, beam in KINDS.items():
         modulus = 1e5 * (law.relaxed / beam.frequency(0.0)) ** 2
         predict = predictor(beam, modulus, beam.static(modulus, 0.0) - observed)
-        for one in recordings:
-            relaxed = beam.frequency(one.load) * np.sqrt(modulus / 1e5)
-            rows.append(measured(one, name, modulus, predict(one), law.rings(relaxed)))
+        for recording in recordings:
+            relaxed = beam.frequency(recording.load) * np.sqrt(modulus / 1e5)
+            rows.append(measured(recording, name, modulus, predict(recording), law.rings(relaxed)))
     usual, nothing = KINDS["lattice"], np.zeros(3)
     modulus = brentq(lambda e: usual.static(e, 0.0)[1] - observed[1], 1e5, 1e6, xtol=10)
     predict = predictor(usual, modulus, nothing)
-    for one in recordings:
-        rows.append(measured(one, "static", modulus, predict(one), (usual.frequency(one.load) * np.sqrt(modulus / 1e5), 0.0)))
+    for recording in recordings:
+        rows.append(
+            measured(
+                recording, "static", modulus, predict(recording), (usual.frequency(recording.load) * np.sqrt(modulus / 1e5), 0.0)
+            )
+        )
     given.output.mkdir(parents=True, exist_ok=True)
     table = pd.DataFrame(rows)
     table.to_csv(given.output / "beam.csv", index=False, float_format="%.6g")

@@ -1,10 +1,10 @@
-"""A lattice at rest under gravity, and what its stiffness is in pascals.
+"""Equilibrium of a lattice under gravity, and its stiffness in pascals.
 
 A load is mass: `Material.mass` of the nodes that carry it.
 
-Only stiffness over mass shows in a motion, so a modulus needs the density. Twice as many nodes along each side of a body need Y / 4
-with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an isotropic lattice
-has Poisson's ratio 1/4 and the shear modulus E / 2.5, and rubber's 1/2 and E / 3 are out of reach.
+A motion determines only stiffness over mass, so a modulus requires the density. If the number of nodes along each side doubles,
+Y / 4 is needed with true masses, and 2 Y at 1 kg per node. Central forces make the tensor symmetric in all indices (Cauchy): an
+isotropic lattice has Poisson's ratio 1/4 and shear modulus E / 2.5; it cannot have those of rubber, 1/2 and E / 3.
 
 Measured on blocks of 10 x 3 x 3 cm, held at one end, springs to 18 neighbors, nodes at the centers of cells (`test_statics.py`):
 
@@ -14,7 +14,7 @@ Measured on blocks of 10 x 3 x 3 cm, held at one end, springs to 18 neighbors, n
     ... bent by its weight, with 5/6 G A in shear    0.90   0.94   0.96
     ... with I (1 - 1 / n^2), that of n areas        0.95   0.97   0.98
 
-The rest is surfaces, which have fewer springs: thin lattices are softer in bending than their modulus says.
+The remaining difference is due to surfaces, which have fewer springs: thin lattices bend more easily than their modulus implies.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from neuspring.core.artifacts import Twin
 from neuspring.core.errors import InputError, NumericalFailure
 
 STEPS_TO_BALANCE = 500
-"""Steps at most. A beam that bends by a quarter of its length takes 12."""
+"""Largest number of steps. A beam that bends by a quarter of its length takes 12."""
 UNBALANCED = 1e-6
-"""Largest force on a node at rest, over the body's weight. Rounding of the energy leaves about 1e-8."""
+"""Largest force on a node at rest over the object's weight. Rounding of the energy causes about 1e-8."""
 
 
 def at_rest(twin: Twin) -> Twin:
-    """The twin in equilibrium under gravity: such are its nodes. Its rest shape stays, and controllers are where frame 0 has them.
+    """The twin with its nodes in equilibrium under gravity; rest shape and controllers of frame 0 are unchanged.
 
-    Hands hold in all frames. Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. Raises InputError
-    for another body and for one that would be below the ground, NumericalFailure where nothing holds a part.
+    Minimizes sum Y l0 (l / l0 - 1)^2 / 2 - sum m g x by Newton steps in a trust region. All controllers hold. Raises InputError for
+    a twin that is not a lattice or that would be below the ground, NumericalFailure if a part is not held.
     """
     from scipy.optimize import minimize
 
     if twin.body:
-        raise InputError("twin.body", "equilibria are found of lattices", twin.body.kind)
+        raise InputError("twin.body", "must be a lattice", twin.body.kind)
     topology, simulation, count = twin.topology, twin.simulation, len(twin.topology.nodes)
     hands, lengths = topology.controllers.astype(np.float64), topology.rest_lengths.astype(np.float64)
     weight = np.outer(masses(twin), [0.0, 0.0, -simulation.up_sign * simulation.gravity])
     first, second = topology.springs.T
 
     def springs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Directions [S, 3], lengths, m, and stiffness, N, [S, 1] of springs between nodes at x [3 N]."""
+        """Directions [S, 3], lengths [S, 1] [m] and stiffness [S, 1] [N] of springs between nodes at x [3 N]."""
         points = np.concatenate([x.reshape(-1, 3), hands])
         along = points[second] - points[first]
         length = np.linalg.norm(along, axis=1)
         return along / length[:, None], length[:, None], twin.material.stiffness.astype(np.float64)[:, None]
 
     def at_nodes(values: np.ndarray) -> np.ndarray:
-        """Sums over the springs that end at each node less those that begin there [3 N], of values [S, 3]."""
+        """For each node, the sum of values [S, 3] of springs that end there minus that of springs that begin there [3 N]."""
         ends = [np.bincount(end, column, count + len(hands)) for column in values.T for end in (second, first)]
         return (np.stack(ends[::2], axis=1) - np.stack(ends[1::2], axis=1))[:count].ravel()
 
@@ -76,25 +76,25 @@ def at_rest(twin: Twin) -> Twin:
     options = {"gtol": 1e-3 * UNBALANCED * scale, "maxiter": STEPS_TO_BALANCE}
     found = minimize(energy, start, jac=True, hessp=product, method="trust-krylov", options=options)
     if not np.abs(found.jac).max() <= UNBALANCED * scale:
-        raise NumericalFailure(f"the twin is not at rest under gravity after {found.nit} steps: is every part of it held?")
+        raise NumericalFailure(f"the twin is not at rest under gravity after {found.nit} steps; a part may not be held")
     nodes = found.x.reshape(-1, 3)
     if simulation.ground and (lowest := float((simulation.up_sign * nodes[:, 2]).min())) < 0:
-        rule = "contacts are no part of an equilibrium, so all nodes must be above it"
+        rule = "all nodes must be above the ground, because an equilibrium has no contacts"
         raise InputError("simulation.ground", rule, f"z = {lowest:.3g} m", "Set ground to false.")
     return replace(twin, topology=replace(topology, nodes=nodes.astype(np.float32), rest_shape=topology.canonical))
 
 
 def masses(twin: Twin) -> np.ndarray:
-    """Mass of each node [N], kg: 1 where the material says nothing."""
+    """Mass of each node [N], kg; 1 if the material has none."""
     own = twin.material.mass
     return own.astype(np.float64) if len(own) else np.ones(len(twin.topology.nodes))
 
 
 def elasticity(twin: Twin, density: float) -> np.ndarray:
-    """Stiffness tensor of the body that a lattice stands for [3, 3, 3, 3], Pa, if its nodes move as the strain says.
+    """Stiffness tensor of the continuum that a lattice represents [3, 3, 3, 3], Pa, for affine deformations.
 
-    A spring under the strain e is longer by l0 n e n, n its direction, so C = sum Y l0 n n n n / V over springs between nodes. The
-    volume V is mass / density [kg/m^3], and only forces per mass are in a twin: density times the sum over the masses of the nodes.
+    Under the strain e a spring of direction n gets longer by l0 n e n, so C = sum Y l0 n n n n / V over springs between nodes. The
+    volume V is the mass of the nodes over `density` [kg/m^3].
     """
     topology, count = twin.topology, twin.topology.object_spring_count
     ends = topology.canonical.astype(np.float64)[topology.springs[:count]]
@@ -105,10 +105,10 @@ def elasticity(twin: Twin, density: float) -> np.ndarray:
 
 
 def young(twin: Twin, density: float) -> np.ndarray:
-    """Young's moduli along x, y and z of the body that a lattice stands for [3], Pa: see `elasticity`.
+    """Young's moduli along x, y and z of the continuum that a lattice represents [3], Pa; see `elasticity`.
 
-    Where springs lie in all directions alike, both of Lame's numbers are sum Y l0 / (15 V), E is sum Y l0 / (6 V), and Poisson's
-    ratio 1/4. Without resistance in some direction, as of a sheet across itself, its modulus is that of the rest.
+    For springs in all directions, both Lame parameters are sum Y l0 / (15 V), E is sum Y l0 / (6 V), and Poisson's ratio is 1/4.
+    Directions without resistance, such as the normal of a sheet, are left out of the inverse.
     """
     tensor, pairs = elasticity(twin, density), list(zip(*np.triu_indices(3), strict=True))
     # Strains e_ij and e_ji are one unknown, gamma_ij = 2 e_ij.

@@ -1,4 +1,4 @@
-"""Sections of several twins at once: of one topology, of topologies of their own, and the candidates of a search."""
+"""Sections with several twins at once: one topology, different topologies, candidates of a search."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from results.published.bench.simulators import Frame, Times
 from results.published.bench.table import Row
 
 GENERATION = 11
-"""Candidates of a generation: what CMA-ES proposes for 12 variables."""
+"""Candidates of a generation: the default of CMA-ES for 12 variables."""
 
 
 def softer(twin: Twin, count: int) -> list[Twin]:
-    """Twins of one topology, each softer than the one before, down to half the stiffness."""
+    """Twins of one topology with decreasing stiffness, down to half."""
     materials = [replace(twin.material, stiffness=twin.material.stiffness * scale) for scale in np.linspace(1, 0.5, count)]
     return [replace(twin, material=material) for material in materials]
 
 
 def by_batch(bench: Bench) -> list[Row]:
-    """More twins in a call, on the small box."""
+    """Rows for 1 to 64 twins in one call, on the small box."""
     twin, hands = box(*CASES["a"])
     rows = []
     for kind, gradient in KINDS:
@@ -49,14 +49,14 @@ def by_batch(bench: Bench) -> list[Row]:
 
 
 def by_topologies(bench: Bench) -> list[Row]:
-    """Twins of the small box's nodes, each with a topology of its own: one after the other, and in one call."""
+    """Rows for twins with the nodes of the small box and different topologies, one by one and in one call."""
     nodes, substeps, _ = CASES["a"]
     count = 64 if bench.on_gpu else 16
     scenes = [box(nodes, substeps, size) for size in np.linspace(16, 32, count).astype(int)]
     twins, hands = [twin for twin, _ in scenes], scenes[0][1]
     own = round(statistics.mean([len(twin.topology.springs) for twin in twins]))
     every = Union([twin.topology for twin in twins]).springs
-    bench.notes.append(f"{count} topologies, {bench.device}: {own:,} springs in the mean, {every:,} in the graph of all")
+    bench.notes.append(f"{count} topologies, {bench.device}: {own:,} springs on average, {every:,} in the union")
     rows = []
     for kind, gradient in KINDS:
         first, second = f"{count} topologies one by one, {kind}", f"{count} topologies together, {kind}"
@@ -71,7 +71,7 @@ def by_topologies(bench: Bench) -> list[Row]:
 
 
 def one_by_one(bench: Bench, twins: Sequence[Twin], hands: np.ndarray, gradient: bool) -> Frame:
-    """A frame of each twin by a solver of its own; positions and gradient are those of the first."""
+    """A frame of each twin with its own solver; positions and gradient are those of the first twin."""
     frames = [frame_of(bench.ours, twin, hands, gradient) for twin in twins]
 
     def run() -> None:
@@ -82,61 +82,67 @@ def one_by_one(bench: Bench, twins: Sequence[Twin], hands: np.ndarray, gradient:
 
 
 def of_search(bench: Bench) -> list[Row]:
-    """A search of a plush, per rollout, with what it takes to make candidates and to judge them.
+    """Rows for a search on a plush, seconds per rollout, including creation and scoring of candidates.
 
-    On a CPU a candidate's cost must be the same in every company; on CUDA one generation is compared, since the next one depends
-    on every cost.
+    On a CPU the cost of a candidate must not depend on the other lanes. On CUDA only one generation is compared, because the next
+    one depends on every cost.
     """
     rollouts = GENERATION if bench.quick or bench.on_gpu else 4 * GENERATION
     alone = "one by one" if bench.on_gpu else "one by one, one thread"
-    ways = {alone: {"together": 1}}
+    variants = {alone: {"together": 1}}
     if bench.on_gpu:
-        ways |= {f"{GENERATION} in one launch": {}}
+        variants |= {f"{GENERATION} in one launch": {}}
     else:
-        ways |= {"in lanes, one thread": {}, f"in lanes, {os.cpu_count()} threads": {"threads": os.cpu_count() or 1}}
+        variants |= {"in lanes, one thread": {}, f"in lanes, {os.cpu_count()} threads": {"threads": os.cpu_count() or 1}}
     case = problem(rollouts, bench.device)
     warm(bench.device)
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    found: dict[str, SearchResult] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    searches: dict[str, SearchResult] = {}
     for _ in range(1 if bench.quick else 2):
-        for name, way in ways.items():
+        for name, changes in variants.items():
             begin = time.perf_counter()
-            found[name] = search(replace(case, **way), 0)
+            searches[name] = search(replace(case, **changes), 0)
             seconds[name].append((time.perf_counter() - begin) / rollouts)
-    judge_alike(bench, found, alone)
-    describe(bench, case, found[alone], {name: min(spent) for name, spent in seconds.items()})
+    compare_costs(bench, searches, alone)
+    add_notes(bench, case, searches[alone], {name: min(spent) for name, spent in seconds.items()})
     rows = []
     for name, spent in seconds.items():
-        its = Times(tuple(spent))
+        times = Times(tuple(spent))
         row = Row(
-            section="search", name=name, device=bench.device, median=its.median, least=its.least, unit="s", nodes=len(case.labels)
+            section="search",
+            name=name,
+            device=bench.device,
+            median=times.median,
+            least=times.least,
+            unit="s",
+            nodes=len(case.labels),
         )
         if name != alone:
-            ratio = its.over(Times(tuple(seconds[alone])))
+            ratio = times.over(Times(tuple(seconds[alone])))
             row = replace(row, ratio=ratio.median, least_ratio=ratio.least, reference=alone)
         rows.append(row)
     return rows
 
 
-def judge_alike(bench: Bench, found: dict[str, SearchResult], alone: str) -> None:
-    """Costs of all candidates against those of the search one by one: equal bit for bit on a CPU, near on CUDA."""
-    wanted = found[alone].trace["cost"].to_numpy()
-    for name, result in found.items():
+def compare_costs(bench: Bench, searches: dict[str, SearchResult], alone: str) -> None:
+    """Compare costs of all candidates with those of the search one by one: equal bit for bit on a CPU, close on CUDA."""
+    reference_costs = searches[alone].trace["cost"].to_numpy()
+    for name, result in searches.items():
         costs = result.trace["cost"].to_numpy()
         if not bench.on_gpu:
-            assert np.array_equal(costs, wanted), f"{name}: costs differ from those one by one"
+            assert np.array_equal(costs, reference_costs), f"{name}: costs differ from those one by one"
         elif name != alone:
-            apart = np.abs(costs / wanted - 1).max()
+            apart = np.abs(costs / reference_costs - 1).max()
             bench.notes.append(f"search, {name}, {bench.device}: costs within {apart:.1e} of those one by one")
 
 
-def describe(bench: Bench, case: SearchProblem, result: SearchResult, seconds: dict[str, float]) -> None:
-    """Note the size of the search and how its ways compare; of the rounds, the fastest."""
+def add_notes(bench: Bench, case: SearchProblem, result: SearchResult, seconds: dict[str, float]) -> None:
+    """Add notes on the size of the search and on the speed of its variants (fastest round)."""
     trace = result.trace
     frames = case.observations.scenario.train_end - 1
     updates = frames * float((trace["springs"] * trace["substeps"]).mean())
     first = next(iter(seconds.values()))
-    size = f"in the mean {trace['springs'].mean():,.0f} springs and {trace['substeps'].mean():.0f} substeps"
+    size = f"mean: {trace['springs'].mean():,.0f} springs and {trace['substeps'].mean():.0f} substeps"
     bench.notes.append(f"search, {bench.device}: {len(trace)} rollouts of {len(case.labels)} nodes over {frames} frames, {size}")
     for name, spent in seconds.items():
         each = f"{1e9 * spent / updates:.1f} ns per spring, substep and candidate, {first / spent:.2f} times as fast"
@@ -144,10 +150,10 @@ def describe(bench: Bench, case: SearchProblem, result: SearchResult, seconds: d
 
 
 def warm(device: str) -> None:
-    """Compile what a search runs, which depends on the widths of its groups."""
+    """Compile the kernels of a search; they depend on the widths of its groups."""
     widths = (1,) if device != "cpu" else (1, LANE_WIDTH)
     for width in widths:
         made = frame.kernels(wp.float32, width, width == 1)
-        its = [made.begin, made.substep] if device != "cpu" else [made.forward]
-        for kernel in (*its, *trials.kernels(width)):
+        frame_kernels = [made.begin, made.substep] if device != "cpu" else [made.forward]
+        for kernel in (*frame_kernels, *trials.kernels(width)):
             load(kernel, device)

@@ -1,4 +1,4 @@
-"""Peaks of memory: of the process on Linux, of torch's tensors on a GPU."""
+"""Peak memory: of the process on Linux, of torch's tensors on a GPU."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import torch
 
 
 def resident_mib() -> float:
-    """Resident memory now, MiB."""
+    """Current resident memory, MiB."""
     return _status("VmRSS")
 
 
 def growth(run: Callable[[], object], device: str = "cpu") -> float:
-    """How far memory rises while `run` runs, MiB."""
+    """Rise of memory during `run`, MiB."""
     if device == "cpu":
-        # Count the peak from now on.
+        # Resets the peak.
         Path("/proc/self/clear_refs").write_text("5")
         before = resident_mib()
         run()

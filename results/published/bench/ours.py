@@ -1,4 +1,4 @@
-"""This project's simulator as the table times it: the only file of the table that knows the engine's interface."""
+"""This package's simulator behind the interface of the benchmark; no other file of the benchmark uses the solver."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from results.published.bench.simulators import Frame
 
 
 class Ours:
-    """The project's solver on a device."""
+    """The solver of the package on a device."""
 
     name = "ours"
 
@@ -25,7 +25,7 @@ class Ours:
         self.device = device
 
     def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
-        """One frame of one twin, by a solver that keeps no substeps."""
+        """One frame of one twin, with a solver that stores no substeps."""
         solver = solver_for(twin, self.device, differentiable=False)
         x, v, begin, end = self._start(twin, hands)
         last: list[torch.Tensor] = []
@@ -82,7 +82,7 @@ class Ours:
         return Frame(learn if gradient else run, lambda: last[0][0].detach().cpu().numpy(), along if gradient else None)
 
     def chain(self, twin: Twin, path: np.ndarray) -> Callable[[], object]:
-        """The gradient of the loss after all frames of a path of the hands [F + 1, C, 3]."""
+        """The gradient of the loss after all frames of a path of the controllers [F + 1, C, 3]."""
         solver = solver_for(twin, self.device, differentiable=True)
         steps = torch.tensor(path, dtype=torch.float32, device=self.device)
         start, rest, *_ = self._start(twin, path[:2])
@@ -98,7 +98,7 @@ class Ours:
         return run
 
     def _start(self, twin: Twin, hands: np.ndarray) -> tuple[torch.Tensor, ...]:
-        """The state at rest, and the hands at both ends of the frame."""
+        """The state at rest, and the controllers at both ends of the frame."""
         x = torch.tensor(twin.topology.nodes, device=self.device)
         begin, end = torch.tensor(hands, dtype=torch.float32, device=self.device)
         return x, torch.zeros_like(x), begin, end
@@ -110,13 +110,13 @@ class Ours:
 
 
 def of_log_stiffness(gradient: torch.Tensor, springs: torch.Tensor) -> np.ndarray:
-    """dL/d(log Y) [S] from the gradient of packed springs [S, 3] and their values: column 0 is dL/dY, and Y dL/dY = dL/d(log Y)."""
+    """dL/d(log Y) = Y dL/dY [S] from the gradient of packed springs [S, 3] and their values; column 0 is dL/dY."""
     along: np.ndarray = (gradient[:, 0] * springs.detach()[:, 0]).cpu().numpy()
     return along
 
 
 def reference_frame(twin: Twin, hands: np.ndarray) -> Frame:
-    """One frame by the specification in NumPy, float64."""
+    """One frame of the NumPy specification in float64."""
     scene, nodes = reference.ReferenceTwin.of(twin), twin.topology.nodes.astype(np.float64)
     last: list[np.ndarray] = []
 

@@ -1,11 +1,12 @@
-"""The released PhysTwin simulator as the table times it, from a checkout of the user's: `--peer PATH`.
+"""The released PhysTwin simulator behind the interface of the benchmark, from a checkout of the user: `--peer PATH`.
 
-The checkout stays as it is. Its simulator and the settings that it reads are copied to a temporary folder, where the name of the
-device is replaced, and are imported from there: this runs code of the checkout. Nothing of it is part of this project.
+The checkout is not changed. Its simulator and settings are copied to a temporary folder, where the device name is replaced, and
+imported from there. This executes code of the checkout, which is not part of this project.
 
-A frame is recorded as a graph, as its trainer does: the substeps alone, or the substeps, a loss and the tape's backward pass. What
-the trainer does at every frame is timed with it: the state, the hands, the tape's gradients set to zero. The optimizer is left out.
-The loss is the plain one that it has for synthetic data (`simulators.LOSS`): the Chamfer distance is no part of the simulation.
+As in PhysTwin's trainer, a frame is recorded as a graph: the substeps, or the substeps, a loss and the tape's backward pass. The
+time includes the trainer's work per frame: setting the state and the controllers, and clearing gradients. The optimizer is left
+out. The loss is PhysTwin's simple loss for synthetic data (`simulators.LOSS`), because the Chamfer distance is not part of the
+simulation.
 """
 
 from __future__ import annotations
@@ -37,15 +38,15 @@ UTILITIES = """import logging
 from .config import cfg
 logger = logging.getLogger("peer")
 """
-"""In the place of the checkout's own, which also import viewers."""
+"""Replaces the checkout's utilities, which also import viewers."""
 ANY_STIFFNESS = (0.0, 1e9)
-"""Its clamp of the stiffness, N: no limit here."""
+"""Limits of the stiffness, N, wide enough to have no effect."""
 
 
 class PhysTwin:
     """The simulator of a checkout on a device.
 
-    Raises InputError where the folder is no checkout of it, or of a version whose text this file does not know.
+    Raises InputError if the folder is not a checkout, or has a version that this adapter does not know.
     """
 
     name = "PhysTwin"
@@ -57,7 +58,7 @@ class PhysTwin:
         copy(checkout, Path(self._folder.name), stem, device)
         self._module, self._settings = imported(Path(self._folder.name), stem, device)
         if not hasattr(self._module, SYSTEM):
-            raise InputError(checkout / SIMULATOR, f"must define {SYSTEM}", None, "Give --peer another version of the checkout.")
+            raise InputError(checkout / SIMULATOR, f"must define {SYSTEM}", None, "Pass another version to --peer.")
 
     def forward(self, twin: Twin, hands: np.ndarray) -> Frame:
         """One frame, as in its inference."""
@@ -84,7 +85,7 @@ class PhysTwin:
 
         def run() -> None:
             with wp.ScopedDevice(self.device):
-                # Its trainer does this after a frame. Before, it leaves the gradient readable after the run.
+                # The trainer does this after a frame. Doing it before keeps the gradient readable after the run.
                 tape.zero()
                 system.clear_loss()
                 self._begin(system, inference=False)
@@ -93,20 +94,20 @@ class PhysTwin:
         return Frame(run, lambda: positions(system), lambda: system.wp_spring_Y.grad.numpy().copy())
 
     def _begin(self, system: Any, *, inference: bool) -> None:
-        """The state at rest and the hands of the frame."""
+        """Set the state at rest and the controllers of the frame."""
         system.set_init_state(system.wp_init_vertices, system.wp_init_velocities, pure_inference=inference)
         system.set_controller_target(1, pure_inference=inference)
         if system.object_collision_flag:
             system.update_collision_graph()
 
     def _system(self, twin: Twin, hands: np.ndarray) -> Any:
-        """A twin as it takes one: unit masses, the logarithm of the stiffness, one dashpot for all springs."""
+        """A twin in PhysTwin's form: unit masses, log stiffness, one dashpot for all springs."""
         topology, material, simulation = twin.topology, twin.material, twin.simulation
         dashpot = single_dashpot(twin)
         options: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
         path = torch.tensor(hands, **options)
         count = len(topology.nodes)
-        # It records its own graph of its own loss where this is set.
+        # If set, PhysTwin records its own graph with its own loss.
         self._settings.use_graph = False
         low, high = ANY_STIFFNESS
         with wp.ScopedDevice(self.device):
@@ -140,14 +141,14 @@ class PhysTwin:
 
 
 def copy(checkout: Path, folder: Path, stem: str, device: str) -> None:
-    """Copy what the simulator needs into a package in `folder`, its simulator as module `stem` for a device."""
+    """Copy the simulator and its settings into a package in `folder`; the simulator becomes module `stem` for a device."""
     for name in (SIMULATOR, *SETTINGS):
         if not (checkout / name).is_file():
-            rule = f"must be a checkout of PhysTwin, with {name}"
-            raise InputError("--peer", rule, checkout, "Give the folder that git clone made.")
+            rule = f"must be a checkout of PhysTwin with {name}"
+            raise InputError("--peer", rule, checkout, "Pass the folder that git clone created.")
     text = (checkout / SIMULATOR).read_text(encoding="utf-8")
     if DEVICE not in text:
-        raise InputError(checkout / SIMULATOR, f"must name its device by {DEVICE}", None, "Adapt DEVICE in this adapter to it.")
+        raise InputError(checkout / SIMULATOR, f"must set its device by {DEVICE}", None, "Change DEVICE in this adapter.")
     utilities = folder / PACKAGE / "utils"
     utilities.mkdir(parents=True)
     (folder / PACKAGE / "__init__.py").touch()
@@ -158,10 +159,10 @@ def copy(checkout: Path, folder: Path, stem: str, device: str) -> None:
 
 
 def imported(folder: Path, stem: str, device: str) -> tuple[ModuleType, Any]:
-    """The module and its settings, with all kernels and their adjoints compiled: a capture must load none."""
+    """The module and its settings, with all kernels and adjoints compiled, because a graph capture cannot load any."""
     start_warp()
     before = wp.get_device()
-    # From `folder` alone, and forgotten afterwards: a copy for another device has the same names. Adjoints are Warp's own there.
+    # Import from `folder` only and forget the modules: a copy for another device has the same names. Warp makes the adjoints.
     with (
         mock.patch.dict(sys.modules),
         mock.patch.object(sys, "path", [str(folder), *sys.path]),
@@ -181,17 +182,17 @@ def imported(folder: Path, stem: str, device: str) -> tuple[ModuleType, Any]:
 
 
 def single_dashpot(twin: Twin) -> float:
-    """The dashpot of all springs, N s/m. Raises InputError where the peer cannot simulate the twin."""
+    """The dashpot of all springs, N s/m. Raises InputError if PhysTwin cannot simulate the twin."""
     simulation, dashpot = twin.simulation, twin.material.dashpot
     if np.ptp(dashpot) > 0:
-        raise InputError("material.dashpot", "the peer has one for all springs", f"{dashpot.min()} to {dashpot.max()}")
+        raise InputError("material.dashpot", "must be equal for all springs with a peer", f"{dashpot.min()} to {dashpot.max()}")
     if not simulation.ground or simulation.gravity != 9.8 or simulation.controller_velocity:
-        rule = "the peer has a ground, a gravity of 9.8 m/s^2 and no controller velocity in dashpots"
+        rule = "must have a ground, a gravity of 9.8 m/s^2 and no controller velocity in dashpots with a peer"
         raise InputError("simulation", rule, simulation)
     return float(dashpot[0])
 
 
 def positions(system: Any) -> np.ndarray:
-    """At the end of the frame, [N, 3], m."""
+    """Positions at the end of the frame [N, 3], m."""
     after: np.ndarray = system.wp_states[-1].wp_x.numpy().copy()
     return after

@@ -1,7 +1,7 @@
-"""A plush that is lifted at one end, as observations of the size of a real capture, for the section of the search.
+"""Observations of a plush that is lifted at one end, with the size of a real capture, for the section `search`.
 
-The body and its head are ellipsoids on the ground, filled with points 1 cm apart in the mean. The observed motion is made up and
-smooth: it need not be any spring's, since a search takes the same time whatever it finds.
+Trunk and head are ellipsoids on the ground, filled with points 1 cm apart on average. The observed motion is smooth and not
+physical, because the time of a search does not depend on its result.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ TRACKED, SURFACE, NODES, HANDS = 300, 150, 650, 30
 PARTS = (((0.0, 0.0, 0.041), (0.08, 0.05, 0.04)), ((0.095, 0.0, 0.051), (0.04, 0.035, 0.035)))
 """Center and semi-axes of each part, m."""
 LIFT = 0.1
-"""How far the hands rise, m."""
+"""Rise of the controllers, m."""
 
 
 def problem(rollouts: int, device: str) -> SearchProblem:
-    """A search with the settings of the released code and as many substeps as are safe."""
+    """A search with the settings of the released code and a safe number of substeps."""
     return small.search_problem(observations(), search=config.Search(rollouts=rollouts), device=device)
 
 
 @functools.cache
 def observations() -> Observations:
-    """The plush: points near its surface first, which are tracked, then its inside."""
+    """The plush: tracked points near its surface first, then its interior."""
     rng = np.random.default_rng(0)
     points = filled(rng)
     hands = points[np.argsort(points[:, 0])[-HANDS:]] + rng.normal(0, 2e-3, (HANDS, 3)) + np.array([0.02, 0, 0])
@@ -52,7 +52,7 @@ def observations() -> Observations:
 
 
 def filled(rng: np.random.Generator) -> np.ndarray:
-    """NODES points in the parts, none nearer than 6 mm to another, outermost first."""
+    """NODES points in the parts, at least 6 mm apart, outermost first."""
     chosen = np.empty((0, 3))
     depth: list[float] = []
     centers, axes = (np.array(values) for values in zip(*PARTS, strict=True))
@@ -67,7 +67,7 @@ def filled(rng: np.random.Generator) -> np.ndarray:
 
 
 def at(points: np.ndarray, frame: int) -> np.ndarray:
-    """Where points are in a frame: the end that is held rises most, the other one stays."""
+    """Positions of points in a frame: the held end rises, the other end stays."""
     share = np.clip((points[:, 0] + 0.08) / 0.215, 0, 1)
     rise = LIFT * np.sin(np.pi / 2 * frame / (FRAMES - 1)) ** 2
     return points + np.outer(share**2 * rise, [0, 0, 1])

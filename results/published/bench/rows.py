@@ -1,4 +1,4 @@
-"""From frames that are ready to run to rows of the table."""
+"""Rows of the table, from prepared frames."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from results.published.bench.simulators import Frame, Simulator, distances, grad
 from results.published.bench.table import Row
 
 KINDS = (("forward", False), ("forward + backward", True))
-"""What is timed of a frame, and whether with its gradient."""
+"""Name of a measurement, and whether it includes the gradient."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What a section measures with."""
+    """Device, simulators and options of a section."""
 
     device: str
     ours: Ours
     peer: Simulator | None = None
     quick: bool = False
     notes: list[str] = field(default_factory=list)
-    """What a reader of the table should know of this run."""
+    """Notes that are printed below the table."""
 
     @property
     def on_gpu(self) -> bool:
-        """Whether this is a run on CUDA."""
+        """Whether the device is CUDA."""
         return self.device != "cpu"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A row to be."""
+    """A row before its measurement."""
 
     name: str
     twin: Twin
@@ -44,11 +44,11 @@ class Entry:
     reference: str = ""
     batch: int = 1
     springs: int = 0
-    """Mean number of twins that differ in it; 0: that of `twin`."""
+    """Mean number of springs if twins differ; 0: that of `twin`."""
 
     @property
     def counts(self) -> tuple[int, int, int, int]:
-        """Nodes, springs, substeps, twins."""
+        """Number of nodes, springs, substeps and twins."""
         topology = self.twin.topology
         return len(topology.nodes), self.springs or len(topology.springs), self.twin.simulation.substeps, self.batch
 
@@ -59,7 +59,7 @@ def frame_of(simulator: Simulator, twin: Twin, hands: np.ndarray, gradient: bool
 
 
 def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
-    """The rows of entries that take turns. Ratios are in time per spring, substep and twin."""
+    """Rows of entries that are measured in turns. Ratios are of time per spring, substep and twin."""
     rounds, seconds = (5, 2.0) if bench.quick else (9, 5.0)
     times = take_turns({entry.name: entry.frame.run for entry in entries}, bench.device, rounds=rounds, seconds=seconds)
     named = {entry.name: entry for entry in entries}
@@ -79,7 +79,7 @@ def timed(bench: Bench, section: str, entries: Sequence[Entry]) -> list[Row]:
 
 
 def agree(bench: Bench, entries: Sequence[Entry]) -> None:
-    """Note how far positions and gradients of frames that ran are from those of their references."""
+    """Add notes on the difference of positions and gradients from those of the reference entries."""
     named = {entry.name: entry for entry in entries}
     for entry in entries:
         if entry.reference:

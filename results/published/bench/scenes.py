@@ -1,4 +1,4 @@
-"""What the benchmarks simulate: boxes of random points, and a sheet folded onto itself."""
+"""Scenes of the benchmark: boxes of random points, and a folded sheet."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from neuspring.physics.topology import uniform_topology
 HANDS = 8
 FRAME_TIME = 1 / 30
 CASES = {"a": (400, 67, 22), "b": (2000, 667, 31), "c": (2500, 667, 22)}
-"""Nodes, substeps, neighbors asked for (self included). The radius of the topology is never the limit."""
+"""Nodes, substeps, neighbors (including the node itself). The connection radius has no effect."""
 SPACING, GAP = 0.005, 0.006
-"""Between the nodes of a sheet and between its layers, m."""
+"""Distance between the nodes of a sheet, and between its layers, m."""
 
 
 def box(nodes: int, substeps: int, neighbors: int, *, self_collision: bool = False) -> tuple[Twin, np.ndarray]:
-    """A box of random points just above the ground, held by hands at its top, and the hands of one frame [2, C, 3]."""
+    """A box of random points just above the ground, held at its top, and the controllers of one frame [2, C, 3]."""
     rng = np.random.default_rng(0)
     edge = 0.01 * nodes ** (1 / 3)
     points = rng.uniform(0, edge, (nodes, 3)) + np.array([0, 0, 0.001])
@@ -30,15 +30,15 @@ def box(nodes: int, substeps: int, neighbors: int, *, self_collision: bool = Fal
 
 
 def sheet(nodes: int, substeps: int, neighbors: int = 13) -> tuple[Twin, np.ndarray]:
-    """A square sheet of about `nodes` nodes, folded once, with self-collision, and the hands of one frame [2, C, 3].
+    """A square sheet of about `nodes` nodes, folded once, with self-collision, and the controllers of one frame [2, C, 3].
 
-    Springs and rest lengths are those of the flat sheet. The upper layer lies 6 mm above the lower one, nearer than the contact
-    distance of 10 mm, and falls onto it. Hands lift a part of the upper layer's edge.
+    Springs and rest lengths are those of the flat sheet. The upper layer is 6 mm above the lower one, within the contact distance
+    of 10 mm, and falls onto it. Controllers lift a part of the upper layer's edge.
     """
     columns = int(nodes**0.5)
     rows = nodes // columns
     along, across = np.meshgrid(SPACING * np.arange(columns), SPACING * np.arange(rows), indexing="ij")
-    # Less than a tenth of the spacing: no two distances are the same, as in a captured cloth.
+    # Less than a tenth of the spacing, so that all distances differ, as in a captured cloth.
     noise = np.random.default_rng(0).uniform(-4e-4, 4e-4, (columns * rows, 2))
     flat = np.column_stack([along.ravel(), across.ravel(), np.zeros(columns * rows)]) + np.pad(noise, ((0, 0), (0, 1)))
     edge = flat[-rows:][:HANDS] + np.array([SPACING, 0, 0])
@@ -51,7 +51,7 @@ def sheet(nodes: int, substeps: int, neighbors: int = 13) -> tuple[Twin, np.ndar
 
 
 def folded(flat: np.ndarray, middle: float) -> np.ndarray:
-    """Points of a flat sheet [N, 3] with all beyond x = `middle` turned back over the rest by a half circle as high as GAP."""
+    """Points of a flat sheet [N, 3], folded back beyond x = `middle` by a half circle of height GAP."""
     radius = GAP / 2
     past = np.maximum(flat[:, 0] - middle, 0)
     angle = np.minimum(past / radius, np.pi)
@@ -61,13 +61,13 @@ def folded(flat: np.ndarray, middle: float) -> np.ndarray:
 
 
 def shortened(twin: Twin, substeps: int) -> Twin:
-    """The same twin in frames of fewer substeps of the same length."""
+    """The twin with shorter frames: fewer substeps of the same length."""
     simulation = replace(twin.simulation, frame_time=substeps * twin.simulation.substep, substeps=substeps)
     return replace(twin, simulation=simulation)
 
 
 def stable_twin(topology: Topology, simulation: Simulation, contact_distance: float) -> Twin:
-    """A twin as stiff as its substep allows with a margin."""
+    """A twin with the largest stiffness that its substep allows, with a margin."""
     scalars = dict.fromkeys(("ground_elasticity", "ground_friction", "contact_elasticity", "contact_friction"), 0.5)
     count = len(topology.springs)
     common = {"drag": 3.0, "contact_distance": contact_distance, **scalars}

@@ -1,4 +1,4 @@
-"""The sections of the table: what is measured, and in which company."""
+"""Sections of the table."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from results.published.bench.simulators import Simulator, distances
 from results.published.bench.table import Row
 
 TOGETHER = 16
-"""Twins of one call in the first section: the lanes of a vector."""
+"""Twins per call in the first section."""
 
 
 def frames(bench: Bench) -> list[Row]:
-    """A frame of two boxes: one twin alone, several together, the peer, and on a CPU the specification of the small one."""
+    """Rows for a frame of two boxes: one twin, several together, the peer, and on a CPU the NumPy specification."""
     rows = []
     for case in ("a",) if bench.quick else ("a", "c") if bench.on_gpu else ("a", "b"):
         twin, hands = box(*CASES[case])
@@ -48,13 +48,13 @@ def _company(bench: Bench, case: str, twin: Twin, hands: np.ndarray) -> Iterator
 
 
 def by_nodes(bench: Bench) -> list[Row]:
-    """More nodes of a box."""
+    """Rows for boxes with more and more nodes."""
     sizes = (500, 5_000) if bench.quick else (500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
     return _scaling(bench, "nodes", [(f"{size:,} nodes", box(size, 20, 22)) for size in sizes])
 
 
 def _scaling(bench: Bench, section: str, scenes: Sequence[tuple[str, tuple[Twin, np.ndarray]]]) -> list[Row]:
-    """Forward alone and with its gradient; the first scene is the reference."""
+    """Rows forward and with gradients; the first scene is the reference."""
     rows = []
     for kind, gradient in KINDS:
         entries = [Entry(f"{name}, {kind}", twin, frame_of(bench.ours, twin, hands, gradient)) for name, (twin, hands) in scenes]
@@ -63,7 +63,7 @@ def _scaling(bench: Bench, section: str, scenes: Sequence[tuple[str, tuple[Twin,
 
 
 def by_contacts(bench: Bench) -> list[Row]:
-    """A sheet folded onto itself, with self-collision; a note says how time grows with the nodes."""
+    """Rows for a folded sheet with self-collision, and notes on the growth of time with the nodes."""
     rows: list[Row] = []
     grown: dict[str, list[Row]] = {}
     for size in (2_000,) if bench.quick else (2_000, 4_300, 8_600):
@@ -72,20 +72,20 @@ def by_contacts(bench: Bench) -> list[Row]:
             rows.append(row)
             grown.setdefault(row.name.partition(": ")[2], []).append(row)
         if bench.peer:
-            _touch_alike(bench, bench.peer, twin, hands)
-    for name, its in grown.items():
-        if len(its) > 1:
-            bench.notes.append(f"collision, {name}, {bench.device}: time grows as nodes to the power of {exponent(its):.2f}")
+            _note_contacts(bench, bench.peer, twin, hands)
+    for name, group in grown.items():
+        if len(group) > 1:
+            bench.notes.append(f"collision, {name}, {bench.device}: time grows as nodes to the power of {exponent(group):.2f}")
     return rows
 
 
 def exponent(rows: Sequence[Row]) -> float:
-    """p of least time ~ nodes^p, by least squares of the logarithms."""
+    """p in least time ~ nodes^p, by least squares of the logarithms."""
     return float(np.polyfit(np.log([row.nodes for row in rows]), np.log([row.least for row in rows]), 1)[0])
 
 
-def _touch_alike(bench: Bench, peer: Simulator, twin: Twin, hands: np.ndarray) -> None:
-    """Note how many nodes agree after a part of a frame. Rounding decides whether two nodes just touch, and contacts amplify it."""
+def _note_contacts(bench: Bench, peer: Simulator, twin: Twin, hands: np.ndarray) -> None:
+    """Add a note on how many nodes agree after a part of a frame; contacts amplify rounding."""
     substeps, tolerance = 15, 1e-7
     pair = [frame_of(simulator, shortened(twin, substeps), hands, False) for simulator in (bench.ours, peer)]
     for frame in pair:
@@ -96,9 +96,9 @@ def _touch_alike(bench: Bench, peer: Simulator, twin: Twin, hands: np.ndarray) -
 
 
 def memory(bench: Bench) -> list[Row]:
-    """A gradient through many frames: with the states between frames, and with those of every substep."""
+    """Rows for memory of a gradient through many frames: with states between frames, and with states of every substep."""
     count = 15 if bench.quick else 150
-    # In a process of its own, whose memory nothing else has used and given back.
+    # A new process, because freed memory of an old one would hide the growth.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         between, every = process.submit(rises, bench.device, count).result()
     (nodes, substeps, _), springs = CASES["a"], len(box(*CASES["a"])[0].topology.springs)
@@ -110,20 +110,20 @@ def memory(bench: Bench) -> list[Row]:
 
 
 def rises(device: str, count: int) -> tuple[float, float]:
-    """MiB by which memory rises during a gradient through `count` frames: of states between frames, of states of every substep."""
+    """Rise of memory, MiB, of a gradient through `count` frames: states between frames, and states of every substep."""
     torch.set_num_threads(1)
     ours, (twin, hands) = Ours(device), box(*CASES["a"])
     substeps = twin.simulation.substeps
-    # Up and down again: the hands stay near the body.
+    # Up and down, so that the controllers stay near the object.
     path = hands[[k % 2 for k in range(count + 1)]]
     step = np.arange(count * substeps + 1)
     frame, share = step // substeps, (step % substeps / substeps)[:, None, None]
     fine = path[frame] * (1 - share) + path[np.minimum(frame + 1, count)] * share
     found = []
-    for body, way in ((twin, path), (shortened(twin, 1), fine)):
-        # What the first frames allocate for good is no part of the growth.
-        ours.chain(body, way[:3])()
-        found.append(growth(ours.chain(body, way), device))
+    for body, hands_path in ((twin, path), (shortened(twin, 1), fine)):
+        # Exclude permanent allocations of the first frames.
+        ours.chain(body, hands_path[:3])()
+        found.append(growth(ours.chain(body, hands_path), device))
     return found[0], found[1]
 
 
@@ -137,4 +137,4 @@ SECTIONS: dict[str, Callable[[Bench], list[Row]]] = {
     "memory": memory,
 }
 ON_CUDA = ("frame", "batch", "topologies", "search", "collision")
-"""Sections of a run on CUDA, which is to end within two minutes; the others on demand."""
+"""Default sections on CUDA, which end within two minutes."""

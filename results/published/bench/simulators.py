@@ -1,7 +1,7 @@
-"""What the table times: a simulator behind a small interface, and the clock.
+"""The interface of a simulator, and the clock.
 
-The simulators that are compared take turns within every round, so that what else runs on the machine reaches all of them, and a
-comparison is the median of the ratios of the rounds.
+Simulators take turns within every round, so that other load on the machine affects all of them. A comparison is the median of the
+ratios of the rounds.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import warp as wp
 from neuspring.core.artifacts import Twin
 
 LOSS = "the smooth L1 loss of the final positions against the origin, its mean over 3 N coordinates"
-"""Every simulator differentiates it, so that gradients can be compared too."""
+"""Every simulator differentiates this loss, so that gradients can be compared."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame that is ready to run, again and again from the same start."""
+    """A prepared frame that can run repeatedly from the same start."""
 
     run: Callable[[], object]
-    """Simulate the frame; of `forward_backward`, also the gradient of LOSS in the stiffness of every spring."""
+    """Simulate the frame; for `forward_backward` also the gradient of LOSS by the stiffness of every spring."""
     positions: Callable[[], np.ndarray]
-    """[N, 3], m, at the end of the frame that ran last."""
+    """Positions [N, 3], m, at the end of the last run."""
     gradient: Callable[[], np.ndarray] | None = None
-    """[S], dL / d(log stiffness) of the frame that ran last."""
+    """dL / d(log stiffness) [S] of the last run."""
 
 
 class Simulator(Protocol):
-    """Prepares frames. Hands [2, C, 3], m, are the controllers at the start and at the end of the frame."""
+    """Prepares frames. `hands` [2, C, 3], m: controllers at the start and at the end of the frame."""
 
     name: str
 
@@ -42,7 +42,7 @@ class Simulator(Protocol):
         """One frame of one twin."""
 
     def forward_backward(self, twin: Twin, hands: np.ndarray) -> Frame:
-        """The same with its gradient."""
+        """One frame of one twin with its gradient."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,16 @@ class Times:
         return statistics.median(self.seconds)
 
     def over(self, other: Times) -> Times:
-        """Times in units of those of another that ran in the same rounds."""
+        """Ratios of these times to those of `other` in the same rounds."""
         return Times(tuple(mine / its for mine, its in zip(self.seconds, other.seconds, strict=True)))
 
 
 def take_turns(
     actions: Mapping[str, Callable[[], object]], device: str = "cpu", *, rounds: int = 9, least: int = 3, seconds: float = 5.0
 ) -> dict[str, Times]:
-    """Times of every action in the same rounds; one more round before them is not timed.
+    """Times of every action in the same rounds, after one round that is not timed.
 
-    At most `rounds` rounds, and no further one after `seconds` once there are `least`. The first action of a round changes from
-    round to round.
+    Runs at most `rounds` rounds, and stops after `seconds` once `least` rounds are done. The first action changes with each round.
     """
     names = list(actions)
     spent: dict[str, list[float]] = {name: [] for name in actions}
@@ -93,7 +92,7 @@ def take_turns(
 
 
 def distances(frame: Frame, other: Frame) -> np.ndarray:
-    """Between the nodes of two frames that ran, [N], m."""
+    """Distances between the nodes of two frames that ran [N], m."""
     apart: np.ndarray = np.linalg.norm(frame.positions().astype(np.float64) - other.positions(), axis=1)
     return apart
 

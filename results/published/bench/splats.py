@@ -1,8 +1,8 @@
 """Time and memory of the rasterizer: `python -m results.published.bench.splats [--device cuda:0] [--repeats 9]`.
 
-A ball of splats, as a toy before a camera: 7 % of the picture, all splats in view, isotropic, harmonics of degree 3 as tensors that
-ask for gradients. Columns: medians over repeats of the forward pass and of both passes, and the growth of the peak memory. On a GPU
-848 x 480 with 100,000 splats, and the same with gsplat where it works. Then skinning: splats and nodes grow together.
+The scene is a ball of isotropic splats with harmonics of degree 3 that covers 7 % of the image; all tensors have gradients.
+Columns are medians over repeats of the forward pass and of both passes, and the rise of peak memory. On a GPU it also draws
+100,000 splats at 848 x 480, by gsplat too if it works. Then it measures skinning, with splats and nodes growing together.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DEGREE = 3
 
 
 def ball(count: int, device: str) -> list[torch.Tensor]:
-    """Splats on an ellipsoid 0.6 m before the camera, as wide as they lie apart."""
+    """Splats on an ellipsoid 0.6 m in front of the camera, as large as their spacing."""
     rng = np.random.default_rng(0)
     towards = rng.normal(size=(count, 3))
     means = 0.1 * towards / np.linalg.norm(towards, axis=1, keepdims=True) * [1.5, 1, 1] + [0, 0, 0.6]
@@ -65,7 +65,7 @@ def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend:
 
     both()
     if device == "cpu":
-        # What was freed must not hide what is needed again (glibc).
+        # Freed memory would hide the growth (glibc).
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     grown = growth(both, device)
     times = take_turns({"forward": forward, "both": both}, device, rounds=repeats, least=repeats)
@@ -76,7 +76,7 @@ def bench(size: tuple[int, int], count: int, device: str, repeats: int, backend:
 
 
 def skinning(device: str) -> None:
-    """Time per frame as splats and nodes grow together."""
+    """Print the time per frame for growing numbers of splats and nodes."""
     print(f"\nskinning\n{'splats':>8}{'nodes':>8}{'ms/frame':>12}{'ns/splat':>12}")
     for count in (2_000, 10_000, 50_000):
         nodes = np.random.default_rng(1).uniform(-0.1, 0.1, (count // 10, 3))
@@ -101,11 +101,11 @@ def main() -> None:
         for count in COUNTS:
             bench(size, count, options.device, options.repeats, "warp")
     if options.device != "cpu":
-        ours = bench((848, 480), 100_000, options.device, options.repeats, "warp")
+        our_seconds = bench((848, 480), 100_000, options.device, options.repeats, "warp")
         try:
             choose_backend("gsplat", options.device)
-            theirs = bench((848, 480), 100_000, options.device, options.repeats, "gsplat")
-            print(f"gsplat takes {theirs / ours:.2f} of our time")
+            gsplat_seconds = bench((848, 480), 100_000, options.device, options.repeats, "gsplat")
+            print(f"gsplat takes {gsplat_seconds / our_seconds:.2f} of our time")
         except InputError as error:
             print(f"gsplat: {error}")
     skinning(options.device)

@@ -1,4 +1,6 @@
-"""A frame of Spring-Gaus with its gradient, by kernels and in eager torch: python -m results.published.bench.spring_gaus [DEVICE]
+"""Time of a frame of Spring-Gaus with its gradient, in kernels and in eager torch.
+
+    python -m results.published.bench.spring_gaus [DEVICE]
 
 Both in float32, on one CPU thread or on a GPU (`cuda`); states and gradients are compared before the times.
 """
@@ -20,14 +22,14 @@ ANCHORS, SUBSTEPS, REPEATS = 1024, 100, 5
 
 
 def main() -> None:
-    """Print milliseconds per frame, and their ratio."""
+    """Print milliseconds per frame and their ratio."""
     torch.set_num_threads(1)
     device = resolve_device(sys.argv[1] if len(sys.argv) > 1 else "cpu")
     model, hands = bar()
     kernels, eager = ByKernels(model, hands, device), InTorch(model, hands, device)
     for found, wanted in zip(kernels.run(), eager.run(), strict=True):
         scale = float(wanted.abs().max())
-        # Rounding grows in so stiff a body; the tests compare them in float64.
+        # Rounding grows in so stiff an object; the tests compare in float64.
         np.testing.assert_allclose(found.cpu(), wanted.cpu(), atol=1e-2 * scale)
     times = take_turns({"kernels": kernels.run, "eager": eager.run}, device, rounds=REPEATS, least=REPEATS)
     first, second = (1e3 * its.least for its in times.values())
@@ -37,7 +39,7 @@ def main() -> None:
 
 
 def bar() -> tuple[SpringGausModel, np.ndarray]:
-    """A body that falls, and its hands [2, 30, 3], m."""
+    """A falling object and its controllers [2, 30, 3], m."""
     rng = np.random.default_rng(0)
     cells = np.stack(np.meshgrid(range(16), range(8), range(8), indexing="ij"), axis=-1).reshape(-1, 3)
     anchors = 0.01 * cells + rng.uniform(-1e-3, 1e-3, cells.shape) + [0, 0, 0.3]
@@ -49,7 +51,7 @@ def bar() -> tuple[SpringGausModel, np.ndarray]:
 
 
 class ByKernels:
-    """As in training."""
+    """The implementation of training."""
 
     def __init__(self, model: SpringGausModel, hands: np.ndarray, device: str) -> None:
         self.model, self.hands = model, torch.tensor(hands, device=device)
@@ -58,7 +60,7 @@ class ByKernels:
         self.solver = AnchorSolver(model, model, SUBSTEPS, device)
 
     def run(self) -> list[torch.Tensor]:
-        """Positions after a frame, and gradients of their sum of squares."""
+        """Positions after a frame, and the gradients of their sum of squares."""
         for tensor in self.values.values():
             tensor.grad = None
         after = self.frame(torch.zeros_like(self.x) + self.values["velocity"])
@@ -71,7 +73,7 @@ class ByKernels:
 
 
 class InTorch(ByKernels):
-    """The reference, in float32."""
+    """The reference in eager torch, float32."""
 
     def frame(self, v: torch.Tensor) -> torch.Tensor:
         """Positions after a frame."""

@@ -1,4 +1,4 @@
-"""The rows of the table, its text, its file, its change against the table that was kept last, and what a machine is."""
+"""Rows, text and file of the table, its change against the committed table, and the kind of a machine."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from neuspring.core.table import Table
 
 ROOT = Path(__file__).parents[3]
 COMMITTED = "results/published/bench"
-"""Tables that are part of the repository, a file per kind of machine."""
+"""Folder of committed tables, one file per kind of machine."""
 SCRATCH = "results/bench"
-"""Where a table goes that nobody asked to keep."""
+"""Folder of tables without --save."""
 HEADER = ["section", "row", "device", "nodes", "springs", "substeps", "batch", "median", "least", "ns", "ratio", "to", "change"]
-LEGEND = """ns: median per spring, substep and twin. ratio: of ns to the row named after it, median of the rounds.
-change: of the median since the table of this kind of machine that was kept last."""
+LEGEND = """ns: median per spring, substep and twin. ratio: ns over that of the row in the next column, median of the rounds.
+change: of the median against the committed table of this kind of machine."""
 
 
 def facts() -> dict[str, str | int]:
-    """Processor, GPU, versions and the commit. Nothing that names the machine."""
+    """Processor, GPU, versions and commit; nothing that identifies the machine."""
     processor = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     return {
         "cpu": entry(processor, "model name") or platform.machine(),
@@ -47,13 +47,13 @@ def facts() -> dict[str, str | int]:
 
 
 def entry(text: str, name: str) -> str:
-    """The first value of a name in a text of lines `name : value`; empty where there is none."""
+    """First value of a name in a text of lines `name : value`; empty without one."""
     found = re.search(rf"^{re.escape(name)}\s*:\s*(.*)$", text, re.MULTILINE)
     return found.group(1).strip() if found else ""
 
 
 def kind(machine: dict[str, str | int]) -> str:
-    """A file name for machines that should take the same time: processor, cores and GPU."""
+    """File name of a kind of machine: processor, cores and GPU."""
     cpu = str(machine["cpu"]).replace("(R)", "").replace("(TM)", "")
     words = f"{cpu} {machine['cpu_model']} {machine['cores']} cores {machine['gpu']}"
     return re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
@@ -69,59 +69,59 @@ class Row:
     median: float
     least: float
     unit: str = "ms"
-    """Of median and least."""
+    """Unit of `median` and `least`."""
     nodes: int = 0
     springs: int = 0
     substeps: int = 0
     batch: int = 1
     ratio: float | None = None
-    """To the row `reference` of the same section and device, in time per spring, substep and twin (or in the unit)."""
+    """Time per spring, substep and twin (or in `unit`) over that of row `reference` in the same section and device."""
     least_ratio: float | None = None
     reference: str = ""
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Which row of another table is this one."""
+        """Key of the same row in another table."""
         return self.section, self.name, self.device
 
     @property
     def nanoseconds(self) -> float | None:
-        """Median per spring, substep and twin."""
+        """Median time per spring, substep and twin, ns."""
         return 1e6 * self.median / (self.springs * self.substeps * self.batch) if self.unit == "ms" and self.springs else None
 
 
 def as_record(machine: dict[str, Any], rows: Sequence[Row], notes: Sequence[str]) -> dict[str, Any]:
-    """What a file holds."""
+    """Content of a file."""
     table = [asdict(row) | {"nanoseconds": row.nanoseconds} for row in rows]
     return {"machine": machine, "rows": table, "notes": list(notes)}
 
 
 def save(record: dict[str, Any], kind: str, *, committed: bool) -> Path:
-    """Write a table into one of the two folders; returns its path."""
+    """Write a table into one of the two folders; return its path."""
     path = ROOT / (COMMITTED if committed else SCRATCH) / f"{kind}.json"
     write_text(path, json.dumps(record, indent=1) + "\n")
     return path
 
 
 def last_kept(kind: str) -> dict[str, Any] | None:
-    """The table of a kind of machine that --save wrote last; None where there is none."""
+    """The committed table of a kind of machine; None without one."""
     path = ROOT / COMMITTED / f"{kind}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def medians(record: dict[str, Any]) -> dict[tuple[str, str, str], tuple[float, str]]:
-    """(median, unit) of every row of a file, by `Row.key`."""
+    """`Row.key` -> (median, unit) for the rows of a file."""
     return {(row["section"], row["name"], row["device"]): (float(row["median"]), str(row["unit"])) for row in record["rows"]}
 
 
 def change(row: Row, before: dict[tuple[str, str, str], tuple[float, str]]) -> float | None:
-    """Relative change of the median: -0.1 is a tenth less. None for a row that is new."""
+    """Relative change of the median (-0.1: 10 % less); None for a new row."""
     median, unit = before.get(row.key, (0.0, ""))
     return row.median / median - 1 if median > 0 and unit == row.unit else None
 
 
 def text(rows: Sequence[Row], committed: dict[str, Any] | None) -> str:
-    """The table as it is printed."""
+    """The printed table."""
     before = medians(committed) if committed else {}
     cells = [[*_facts(row), _signed(change(row, before))] for row in rows]
     return "\n".join(Table.of_texts(HEADER, cells).markdown())

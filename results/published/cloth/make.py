@@ -1,13 +1,13 @@
-"""A square cloth that a robot holds at two corners (recordings of Alados5/tfm_matlab, ea4056c): captures, and errors beside floors.
+"""A square cloth that a robot holds at two corners (recordings of Alados5/tfm_matlab, ea4056c): captures and errors.
 
     python -m results.published.cloth.make captures MATS CAPTURES [--corners]
     python -m results.published.cloth.make tables MATS OUT --results RESULTS [...]
 
-MATS has SOMtraj*_10ms.mat of the folder `Processed MAT S7`. `captures` keeps every fourth sample (25 Hz; the authors smoothed about
-9.6 images per second) and rotates each recording so that the cloth hangs straight below its corners in frame 0. Controllers are the
-points of the upper edge. They keep their offset in frame 0 from the line between the corners, and move with that line: the recorded
-edge leaves it by 3 to 5 mm, a row of springs by 2 to 10. With `--corners` the corners alone are controllers. All other nodes are
-annotated. `tables` writes scores.csv, a row per run and recording, and summary.md.
+MATS contains SOMtraj*_10ms.mat of the folder `Processed MAT S7`. `captures` keeps every fourth sample (25 Hz; the authors
+smoothed about 9.6 images per second) and rotates each recording so that the cloth hangs straight below its corners in frame 0.
+Controllers are the points of the upper edge. They keep their offset in frame 0 from the line between the corners and move with
+that line. The recorded edge deviates from this by 3 to 5 mm, a row of springs by 2 to 10 mm. With `--corners` only the corners
+are controllers. All other nodes are annotated. `tables` writes scores.csv, with a row per run and recording, and summary.md.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ STRIDE, RATE = 4, 25.0
 RIVAL = 4
 """Nodes along an edge of the rival's model; a recording's mesh has 3 k + 1."""
 MEAN = -1
-"""In place of a seed: the mean prediction of all."""
+"""Stands for a seed: the mean prediction of all seeds."""
 NOTE = """\
 Mean distance, mm, of predicted and recorded nodes over all frames, open loop, on the rival's 4 x 4 nodes. The two held corners are
-given and count as 0. ±: standard deviation over seeds; last, the error of their mean prediction."""
+given and count as 0. ±: standard deviation over seeds; after the semicolon, the error of their mean prediction."""
 
 
 def read(path: Path) -> np.ndarray:
-    """The nodes [T, n, n, 3], m, of a recording at 25 Hz, made plumb; row 0 is the lowest."""
+    """Nodes [T, n, n, 3], m, of a recording at 25 Hz, rotated to hang straight; row 0 is the lowest."""
     states = np.asarray(loadmat(path, simplify_cells=True)["SOMrec"]["states"], float)
     mesh = states[: len(states) // 2].reshape(3, -1, states.shape[1]).transpose(2, 1, 0)[::STRIDE]
     side = round(mesh.shape[1] ** 0.5)
@@ -50,14 +50,14 @@ def read(path: Path) -> np.ndarray:
 
 
 def edge(mesh: np.ndarray) -> np.ndarray:
-    """The upper edge [T, n, 3] as frame 0 and the two corners give it."""
+    """Upper edge [T, n, 3], m, from frame 0 and the two corners."""
     along = np.linspace(0, 1, mesh.shape[1])[:, None]
     line = mesh[:, -1, :1] * (1 - along) + mesh[:, -1, -1:] * along
     return np.asarray(line + (mesh[0, -1] - line[0]))
 
 
 def error(mesh: np.ndarray, positions: np.ndarray) -> float:
-    """Mean distance, mm, on the rival's nodes of positions [T, N, 3], m: all nodes below the upper edge, or all but the corners."""
+    """Mean distance, mm, on the rival's nodes; positions [T, N, 3], m: nodes below the upper edge, or all but the corners."""
     frames, side = mesh.shape[:2]
     predicted = mesh.copy()
     predicted[:, -1] = edge(mesh)
@@ -69,7 +69,7 @@ def error(mesh: np.ndarray, positions: np.ndarray) -> float:
 
 
 def capture(path: Path, output: Path, corners: bool) -> str:
-    """The capture of a recording, OUTPUT/cloth_TRAJECTORY_TRIAL; returns its name."""
+    """Write the capture OUTPUT/cloth_TRAJECTORY_TRIAL of a recording; return its name."""
     mesh, name = read(path), path.stem.removesuffix("_10ms").replace("SOMtraj", "cloth_")
     described = Description(
         format=1,
@@ -94,7 +94,7 @@ def capture(path: Path, output: Path, corners: bool) -> str:
 
 
 def scores(mats: Path, results: Sequence[Path]) -> pd.DataFrame:
-    """A row per folder of results, method, seed and recording: error, mm."""
+    """Error in mm, one row per folder of results, method, seed and recording."""
     found: dict[tuple[str, str, str], dict[int, np.ndarray]] = {}
     for path in (path for folder in results for path in sorted(folder.glob("*/*/*/transfer_positions.npz"))):
         for target, positions in ((name, array) for name, array in np.load(path).items() if name.startswith("cloth_")):
@@ -108,7 +108,7 @@ def scores(mats: Path, results: Sequence[Path]) -> pd.DataFrame:
 
 
 def table(scored: pd.DataFrame) -> Table:
-    """A row per folder of results and method, a column per recording."""
+    """Table with a row per folder of results and method, and a column per recording."""
     targets = sorted(scored["recording"].unique())
     rows = []
     for names, part in scored.groupby(["results", "method"], sort=False):
@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("task", choices=("captures", "tables"))
     parser.add_argument("mats", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--corners", action="store_true", help="the corners alone are controllers")
+    parser.add_argument("--corners", action="store_true", help="only the corners are controllers")
     parser.add_argument("--results", type=Path, nargs="+", default=[Path("results/cloth")])
     a = parser.parse_args()
     if a.task == "captures":

@@ -1,11 +1,11 @@
-"""Real films of one calibrated camera, and captures of color alone made of them: camera 0 of PhysTwin's scenarios.
+"""Captures of color only, from real videos of one calibrated camera: camera 0 of PhysTwin's scenarios.
 
     python -m results.published.film22.films FOLDER OUTPUT [--cases ...] [--force]
 
-FOLDER has observation_30fps/CASE.mp4, whose left third is the film, or videos/combine_tracking__CASE.mp4 (or combine_rendering__),
-whose left half it is. cameras.json, whose camera 0 is that of all films, lies in it or in phystwin_camera0 beside it. Of each case
-with marks (tests/data/marks, drawn on frame 0 alone) a capture OUTPUT/film_CASE is written: the film, masks carried from the marks,
-and the released split. A capture that is there is left alone without --force.
+FOLDER contains observation_30fps/CASE.mp4, whose left third is the video, or videos/combine_tracking__CASE.mp4 (or
+combine_rendering__), whose left half is the video. cameras.json is in FOLDER or in phystwin_camera0 next to it; its camera 0
+recorded all videos. Each case with annotations of frame 0 (tests/data/marks) becomes a capture OUTPUT/film_CASE: the video, masks
+propagated from the annotations, and the released split. Existing captures are kept unless --force is given.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from neuspring.perception.marks import Mark, Marks
 
 MARKS = Path(__file__).parents[3] / "tests" / "data" / "marks"
 DRAWN = {"phystwin22_films": (640, 362), "phystwin_camera0": (848, 480)}
-"""Folders of marks, and the size, px, of the films on which they were drawn."""
+"""Folders of annotations, and the size of the annotated videos, px."""
 CALIBRATED = (848, 480)
-"""Size of the pictures of cameras.json, px."""
+"""Image size in cameras.json, px."""
 FILMS = {"observation_30fps/{}.mp4": 3, "videos/combine_tracking__{}.mp4": 2, "videos/combine_rendering__{}.mp4": 2}
-"""Videos of a case whose leftmost pane is the film, and how many panes they have; the preferred one first."""
+"""File patterns, preferred first, and their number of panes; the leftmost pane is the video."""
 NAME = "0"
 """The only camera."""
 PREFIX = "film_"
-"""Scenarios of the workflow are named after cases, with this before."""
+"""Prefix of a case in the name of its scenario."""
 RATE = 30.0
-"""Frames per second of the films."""
+"""Frames per second."""
 WORDS = {"twine": "rope", "toy": "zebra", "dinosor": "dinosaur"}
 """The paper's words for categories of the released table."""
 SCALE = 0.66
-"""Of films of 640 pixels, which are compressed: as near to drawn masks as at full size (three known scenes), at half the cost."""
+"""Scale for compressed videos of 640 pixels: as close to drawn masks as at full size (three known scenes), at half the cost."""
 IN_THE_AIR = ("rope_double_hand", "weird_package")
-"""Cases whose object is held above the table in frame 0, as one sees by its shadow there: they have no ground."""
+"""Cases whose object is above the table in frame 0, as its shadow shows: they have no ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Frames:
 
 
 def pane(path: Path, place: int, count: int, most: int | None = None) -> list[np.ndarray]:
-    """RGB images of one of `count` panes that stand side by side in a video; of its first `most` frames, all by default."""
+    """RGB images of pane number `place` of `count` side by side panes of a video; of the first `most` frames, default all."""
     video, colors = cv2.VideoCapture(str(path)), list[np.ndarray]()
     while (most is None or len(colors) < most) and (read := video.read())[0]:
         width = read[1].shape[1] // count
@@ -77,7 +77,7 @@ def pane(path: Path, place: int, count: int, most: int | None = None) -> list[np
 
 
 def film(folder: Path, case: str, most: int | None = None) -> list[np.ndarray]:
-    """RGB images of a case; the first `most`, all by default. Raises FileNotFoundError without a video."""
+    """RGB images of a case, of the first `most` frames, default all. Raises FileNotFoundError without a video."""
     for pattern, count in FILMS.items():
         if (file := folder / pattern.format(case)).is_file():
             return pane(file, 0, count, most)
@@ -90,23 +90,23 @@ def cases_of(folder: Path) -> list[str]:
 
 
 def scaled(points: np.ndarray, size: tuple[int, int], to: tuple[int, int]) -> np.ndarray:
-    """Pixels (x, y) [..., 2] of pictures (width, height) in pictures of another size; pixel centers lie at whole coordinates."""
+    """Pixels (x, y) [..., 2] of images of size (width, height) in images of size `to`; pixel centers have integer coordinates."""
     return np.asarray((points + 0.5) * np.divide(to, size) - 0.5)
 
 
 def camera_of(folder: Path, size: tuple[int, int]) -> Camera:
-    """Camera 0 of cameras.json, for pictures of a size (width, height)."""
+    """Camera 0 of cameras.json, for images of size (width, height)."""
     path = next(path for place in (folder, folder.parent / "phystwin_camera0") if (path := place / "cameras.json").is_file())
     listed: list[dict[str, Any]] = json.loads(path.read_text())["cameras"]
-    one = next(entry for entry in listed if str(entry["camera"]) == NAME)
-    matrix = np.array(one["K"], float)
+    camera = next(entry for entry in listed if str(entry["camera"]) == NAME)
+    matrix = np.array(camera["K"], float)
     matrix[:2, 2] = scaled(matrix[:2, 2], CALIBRATED, size)
     matrix[[0, 1], [0, 1]] *= np.divide(size, CALIBRATED)
-    return Camera(NAME, *size, matrix, np.array(one["camera_to_world"], float))
+    return Camera(NAME, *size, matrix, np.array(camera["camera_to_world"], float))
 
 
 def marks_of(case: str, size: tuple[int, int]) -> tuple[Mark, ...]:
-    """The committed marks of frame 0 of a case, for pictures of a size (width, height); none where none were drawn."""
+    """Committed annotations of frame 0 of a case, for images of size (width, height); empty if there are none."""
     for folder, drawn in DRAWN.items():
         if (path := MARKS / folder / f"{case}.json").is_file():
             marks = Marks.load(path).of(NAME)
@@ -119,7 +119,7 @@ def marks_of(case: str, size: tuple[int, int]) -> tuple[Mark, ...]:
 
 
 def carried(colors: list[np.ndarray], case: str, scale: float = 1.0) -> np.ndarray:
-    """Labels [T, H, W] from the committed marks of frame 0, worked out on pictures of `scale` times the film's size."""
+    """Labels [T, H, W] propagated from the annotations of frame 0, on images of `scale` times the size of the video."""
     from neuspring.extensions.color_alone.segment import carry_film
 
     return carry_film(Frames(colors), marks_of(case, colors[0].shape[1::-1]), scale=scale).labels
@@ -133,9 +133,9 @@ def category_of(case: str) -> str:
 def write_capture(
     folder: Path, output: Path, case: str, most: int | None = None, name: str | None = None, scale: float = 1.0
 ) -> Capture:
-    """Write OUTPUT/NAME (film_CASE by default), of the first `most` frames, all by default.
+    """Write OUTPUT/NAME (default film_CASE) from the first `most` frames, default all.
 
-    Objects lie in frame 0, as one sees there: `pose: lying`. Raises InputError for a wrong calibration or wrong marks.
+    Objects lie on the table in frame 0: `pose: lying`. Raises InputError for a wrong calibration or wrong annotations.
     """
     name, colors = name or f"{PREFIX}{case}", film(folder, case, most)
     size = colors[0].shape[1], colors[0].shape[0]
@@ -165,12 +165,12 @@ def write_capture(
 
 
 def write_captures(folder: Path, output: Path, cases: list[str], *, force: bool = False) -> None:
-    """Captures of all cases that have marks; those that are there are left alone without `force`."""
+    """Write captures of all cases with annotations; existing captures are kept without `force`."""
     for case in cases:
         if (output / f"{PREFIX}{case}" / CAPTURE).exists() and not force:
-            print(f"{case}: is there", flush=True)
+            print(f"{case}: exists, kept", flush=True)
         elif not marks_of(case, CALIBRATED):
-            print(f"{case}: has no marks", flush=True)
+            print(f"{case}: has no annotations", flush=True)
         else:
             capture = write_capture(folder, output, case, scale=SCALE)
             print(f"{case}: {capture.frame_count} frames, training before {capture.train_end}", flush=True)
@@ -180,8 +180,8 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--cases", nargs="+", help="all that have a video by default")
-    parser.add_argument("--force", action="store_true", help="write captures anew that are there")
+    parser.add_argument("--cases", nargs="+", help="default: all with a video")
+    parser.add_argument("--force", action="store_true", help="write existing captures again")
     a = parser.parse_args()
     write_captures(a.folder, a.output, a.cases or cases_of(a.folder), force=a.force)
 

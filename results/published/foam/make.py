@@ -1,10 +1,11 @@
-"""The foam cylinder of PRB-Net (arXiv 2307.07975): our twins beside the published rivals, on the test trajectory.
+"""The foam cylinder of PRB-Net (arXiv 2307.07975): errors of our twins and of the published rivals on the test trajectory.
 
     python -m results.published.foam.make DATA RESULTS --output OUT [--methods rod_slip ...] [--trajectory 8]
 
-DATA has traj{1..8}.csv and rivals/, RESULTS is the folder of `config/data/foam.yaml`. OUT/summary.md has the table, OUT/errors.csv
-a row per model and window, OUT/ways.png ways and errors over time. Errors are distances of the end marker at 250 Hz. A twin is
-rolled out once from the rest of sample 0, by the motion of the base alone, and its way is cut into windows. Rivals begin each anew.
+DATA contains traj{1..8}.csv and rivals/; RESULTS is the folder of `config/data/foam.yaml`. OUT/summary.md contains the table,
+OUT/errors.csv a row per model and window, OUT/ways.png paths and errors over time. Errors are distances of the end marker at 250
+Hz. A twin is rolled out once from rest in sample 0 with the motion of the base, and its path is cut into windows. Rivals restart
+each window.
 """
 
 from __future__ import annotations
@@ -46,23 +47,23 @@ RIVALS = {
 }
 STAYS = "the end stays where it was"
 NOTE = """\
-Mean distance of the end marker, cm, at 250 Hz on trajectory {trajectory}, which begins at rest. **20 s is the one window in which
-twins know no more than rivals**: the base's motion, and rest in the first sample. In shorter windows rivals get the end's place and
-velocity at the begin of each, and do not know what was before; twins are rolled out once from the rest, know the base's motion
-since, and nothing of the end. Rivals' errors are computed from their published predictions by the code that scores ours."""
+Mean distance of the end marker, cm, at 250 Hz on trajectory {trajectory}, which begins at rest. **Only in the window of 20 s
+twins and rivals get the same input**: the motion of the base, and rest in the first sample. In shorter windows rivals get
+position and velocity of the end at the start of each window, and nothing before it. Twins are rolled out once from rest and get
+the motion of the base only. Errors of rivals are computed from their published predictions by the code that scores ours."""
 END = 1
-"""Number of the end marker among the tracked points."""
+"""Index of the end marker among the tracked points."""
 
 
 def errors_of(truth: np.ndarray, predicted: np.ndarray, window: int) -> dict[str, float]:
-    """Mean, root mean square and largest distance, cm, of predictions [n, 3], m, in whole windows."""
+    """Mean, root mean square and largest distance, cm, of predictions [n, 3], m, in complete windows."""
     count = len(truth) // window * window
     apart = CM * np.linalg.norm(truth[:count] - predicted[:count], axis=1)
     return {"windows": count // window, "mean": apart.mean(), "rms": np.sqrt((apart**2).mean()), "largest": apart.max()}
 
 
 def rival(folder: Path, name: str, window: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Truth and prediction of the end [n, 3], m, windows one after the other; None where there is no file."""
+    """Truth and prediction of the end [n, 3], m, in consecutive windows; None without a file."""
     path = folder / "rivals" / f"{name}_predictions_{window}steps.csv"
     if not path.exists():
         return None
@@ -72,15 +73,15 @@ def rival(folder: Path, name: str, window: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def observed(folder: Path, trajectory: int, settings: Config, stride: int = 1) -> Observations:
-    """A trajectory of the data."""
+    """Observations of a trajectory of the data."""
     name = f"foam_{trajectory}"
     row = ScenarioRow(scenario=name, source="posed", category="foam", path="", self_collision=False, ground=False)
     own = replace(settings, posed=replace(settings.posed, stride=stride))
     return posed.observe(row, folder / f"traj{trajectory}.csv", own, folder / name)
 
 
-def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarray:
-    """The end [n, 3], m, at 250 Hz as a twin predicts it, at the frame rate that it was fitted at."""
+def predicted_path(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarray:
+    """Predicted positions of the end [n, 3], m, at 250 Hz, interpolated from the frame rate of the fit."""
     stride = round(RATE * twin.simulation.frame_time)
     here = observed(folder, trajectory, settings, stride)
     body = body_of(twin)
@@ -90,12 +91,12 @@ def way(twin: Twin, folder: Path, trajectory: int, settings: Config) -> np.ndarr
     return np.asarray(CubicSpline(np.arange(0, last + 1, stride), positions)(np.arange(last + 1)))
 
 
-def scored(folder: Path, ways: Mapping[str, np.ndarray], truth: np.ndarray, trajectory: int) -> pd.DataFrame:
-    """A row per model and window: mean, rms and largest error, cm."""
+def scored(folder: Path, paths: Mapping[str, np.ndarray], truth: np.ndarray, trajectory: int) -> pd.DataFrame:
+    """Mean, rms and largest error, cm; one row per model and window."""
     rows = []
     for window in WINDOWS:
         found = {RIVALS[name]: rival(folder, name, window) for name in RIVALS} if trajectory == 8 else {}
-        found |= {name: (truth, path) for name, path in ways.items()}
+        found |= {name: (truth, path) for name, path in paths.items()}
         first = np.arange(len(truth)) // window * window
         found[STAYS] = (truth, truth[first])
         rows += [{"model": name, "window": window} | errors_of(*pair, window) for name, pair in found.items() if pair]
@@ -103,9 +104,9 @@ def scored(folder: Path, ways: Mapping[str, np.ndarray], truth: np.ndarray, traj
 
 
 def drawn(truth: np.ndarray, pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Ways of the end, seen and predicted (pairs of [n, 3], m), by coordinate, and errors below."""
+    """Observed and predicted paths of the end (pairs of [n, 3], m) by coordinate, and errors below."""
     figure, (*panels, errors) = plt.subplots(4, 1, figsize=(9, 8), sharex=True, layout="constrained")
-    panels[0].set_title("gray: seen", fontsize=9, loc="left")
+    panels[0].set_title("gray: observed", fontsize=9, loc="left")
     time = np.arange(WINDOW) / RATE
     for k, panel in enumerate(panels):
         panel.plot(time, truth[:WINDOW, k], color="0.75", lw=4)
@@ -126,17 +127,17 @@ def main() -> None:
     parser.add_argument("results", type=Path)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--methods", nargs="+", default=["rod_knots", "rod_slip"])
-    parser.add_argument("--trajectory", type=int, default=8, help="4 validates, 8 tests")
+    parser.add_argument("--trajectory", type=int, default=8, help="4: validation, 8: test")
     parser.add_argument("--settings", type=Path, default=Path("config/data/foam.yaml"))
     a = parser.parse_args()
     settings = parse(Config, read_yaml(a.settings), str(a.settings))
     truth = observed(a.data, a.trajectory, settings).object_points[:, END].astype(np.float64)
-    ways = {}
+    paths = {}
     for method in a.methods:
         run = RunFolder.of(a.results / settings.scenarios[0] / method / "0")
         twin = Twin.load(run.file(run.learning[-1], "twin"))
-        ways[method] = way(twin, a.data, a.trajectory, settings)
-    table = scored(a.data, ways, truth, a.trajectory)
+        paths[method] = predicted_path(twin, a.data, a.trajectory, settings)
+    table = scored(a.data, paths, truth, a.trajectory)
     a.output.mkdir(parents=True, exist_ok=True)
     write_text(a.output / "errors.csv", table.to_csv(index=False, float_format="%.4f"))
     heads = ["model", *WINDOWS.values(), "20 s: rms", "largest"]
@@ -149,7 +150,7 @@ def main() -> None:
     write_text(
         a.output / "summary.md", "# The foam cylinder\n\n" + note + "\n\n" + markdown([Table.of_texts(heads, rows, "")]) + "\n"
     )
-    pairs = {name: (truth, path) for name, path in ways.items()}
+    pairs = {name: (truth, path) for name, path in paths.items()}
     if a.trajectory == 8:
         pairs |= {RIVALS[name]: rival(a.data, name, WINDOW) for name in ("rnn_LFK", "resnet_LFK", "rfem")}
     save(drawn(truth, pairs), a.output / "ways.png")

@@ -1,23 +1,27 @@
-"""Recovery of a known stiffness by fits of free springs and of a neural spring field: toy scenes, whose truth is known.
+"""Recovery of a known stiffness by fits of free springs and of a neural spring field on toy scenes.
 
     python -m results.published.identifiability.make OUTPUT_FOLDER [--epochs N] [--seeds 0 1 2] [--scenes ...] [--jobs 2]
 
-A fit starts from the truth in everything (topology, dashpots, drag, contact, substeps) but the stiffness, which is the same
-everywhere and too low: 0.6 of the truth's geometric mean. Only the stiffness is trained, without bounds, by both kinds with
-the same settings but for the learning rate. Seeds vary noise, occlusion and the field's first weights.
+A fit starts from the true topology, dashpots, drag, contact and substeps. Only its stiffness is wrong: 0.6 of the truth's
+geometric mean everywhere. The fit trains only the stiffness, without bounds. All kinds have the same settings except for the
+learning rate. Seeds vary noise, occlusion and the field's initial weights.
 
-The learning rates were chosen by the training loss alone, on cloth/shake/smooth (0.5 mm, seed 0, 80
-epochs; mm^2 of a rollout): springs 1.65 at 1e-2, 1.17 at 2e-2, 1.05 at 3e-2; field 1.48 at 1e-3, 1.31 at 2e-3, 1.43 at 3e-3.
-The truth has 0.89, the start 50. With output_bound 1.5 the best were 1.13 and 1.38; with a cosine schedule too 1.44 and 1.34.
+Learning rates were chosen by the training loss on cloth/shake/smooth (0.5 mm, seed 0, 80 epochs; mm^2 of a rollout): springs 1.65
+at 1e-2, 1.17 at 2e-2, 1.05 at 3e-2; field 1.48 at 1e-3, 1.31 at 2e-3, 1.43 at 3e-3. The truth has 0.89, the start 50. With
+output_bound 1.5 the best values are 1.13 and 1.38, with a cosine schedule in addition 1.44 and 1.34.
 
-Compared on object springs: Pearson correlation with the truth and RMS error of log10 stiffness (decades), per spring and for
-the mean of log10 stiffness around each node, which needs no single spring to be identifiable; the same error split into a smooth
-part, the mean over a spring's two ends of the error around a node, and the rough rest; training loss (m^2) of a rollout; track
-error (m) of the frames after the split against the true motion. For scale: the kinds `truth`, `start` and `constant`, the truth's
-geometric mean everywhere. `shuffled` is a field that does not know which springs lie side by side.
+Metrics of object springs:
 
-Writes identifiability.csv, .md and .png. Finished runs lie in runs/ and are not repeated while the settings are the same
-(remove them when the code changes).
+- Pearson correlation with the truth and RMS error of log10 stiffness (decades), per spring and for the mean around each node. The
+  mean does not require single springs to be identifiable.
+- The RMS error split into a smooth part (the mean of the node errors at a spring's two ends) and the rough rest.
+- Training loss (m^2) of a rollout, and track error (m) of future frames against the true motion.
+
+For scale, the kinds `truth`, `start` and `constant` (the truth's geometric mean everywhere) are scored too. `shuffled` is a field
+at permuted midpoints.
+
+Writes identifiability.csv, .md and .png. Finished runs are in runs/ and are not repeated with the same settings; remove them if the
+code changes.
 """
 
 from __future__ import annotations
@@ -65,11 +69,11 @@ NOISES = (0.0, 0.0005, 0.002)
 LIMITS = (0.3, 1 / 0.3)
 """Range of colors: stiffness over the geometric mean of the truth."""
 SHOWN = (0.0005, 0)
-"""Noise [m] and seed of the picture."""
+"""Noise [m] and seed of the figure."""
 CONSTANTS = {"start": 0.6, "constant": 1.0}
 """Homogeneous stiffness as a fraction of the truth's geometric mean."""
 RATES = {"springs": 3e-2, "field": 2e-3, "shuffled": 2e-3}
-"""Fitted kind -> its learning rate. shuffled: a field that does not know which springs lie side by side."""
+"""Fitted kind -> learning rate. shuffled: a field at permuted midpoints."""
 KINDS = ("truth", *CONSTANTS, *RATES)
 METRICS = {
     "correlation": ("r, springs", 1.0, 2),
@@ -86,7 +90,7 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Run:
-    """One fit, or the evaluation of the truth or of a constant stiffness. Noise in meters."""
+    """One fit, or the evaluation of the truth or of a constant stiffness; noise in m."""
 
     scene: str
     noise: float
@@ -100,18 +104,18 @@ class Run:
 
     @property
     def fit(self) -> config.Fit:
-        """Contact scalars practically stand still; the gradient goes through ten frames."""
+        """Settings of the fit; the gradient goes through ten frames, and contact parameters hardly change."""
         rate = RATES.get(self.kind, 1.0)
         field = config.SpringFieldSettings(shuffled=self.kind == "shuffled")
         return config.Fit(epochs=self.epochs, learning_rate=rate, horizon=10, field=field)
 
     def settings(self) -> dict[str, Any]:
-        """Everything that the result depends on, plainly."""
+        """All settings that the result depends on, as plain values."""
         identity = {"scene": self.scene, "noise": self.noise, "seed": self.seed, "kind": self.kind, "constants": CONSTANTS}
         return identity | ({"fit": config.plain(self.fit)} if self.kind in RATES else {})
 
     def record(self, folder: Path) -> dict[str, Any] | None:
-        """Record that a finished run with the same settings left in `folder`."""
+        """Record in `folder` of a finished run with the same settings; None without one."""
         path = folder / f"{self.name}.json"
         record: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
         return record if record and record["settings"] == self.settings() else None
@@ -119,7 +123,7 @@ class Run:
 
 @functools.cache
 def scene_of(path: str, noise: float, seed: int) -> toy.ToyScene:
-    """The toy scene as seen with `noise` [m]."""
+    """The toy scene observed with `noise` [m]."""
     rows = read_scenarios(Path(__file__).parents[3] / "config/scenarios.tsv")
     return toy.make(rows[f"toy_{path.replace('/', '_')}"], toy.ToyObservation(noise=noise, seed=seed))
 
@@ -131,7 +135,7 @@ def constant(truth: Twin, fraction: float) -> Twin:
 
 
 def compare(twin: Twin, scene: toy.ToyScene) -> dict[str, float]:
-    """The metrics of a twin (see the module); what is undefined, such as the correlation of a constant, is left out."""
+    """Metrics of a twin (see the module); undefined ones, such as the correlation of a constant, are left out."""
     topology, seen = scene.truth.topology, scene.observations
     count, values = topology.object_spring_count, {}
     log = np.log10([np.asarray(one.material.stiffness[:count], np.float64) for one in (twin, scene.truth)])
@@ -157,7 +161,7 @@ def compare(twin: Twin, scene: toy.ToyScene) -> dict[str, float]:
 
 
 def execute(run: Run, folder: Path) -> dict[str, Any]:
-    """Make a run; write and return its record: settings, metrics, stiffness of the object springs [N], how the fit went."""
+    """Execute a run; write and return its record: settings, metrics, stiffness of the object springs [N], history of the fit."""
     torch.set_num_threads(1)
     clock = time.perf_counter()
     scene = scene_of(run.scene, run.noise, run.seed)
@@ -193,9 +197,9 @@ def execute(run: Run, folder: Path) -> dict[str, Any]:
 
 
 def execute_all(runs: list[Run], folder: Path, jobs: int) -> list[dict[str, Any]]:
-    """The records of all runs, in their order; `jobs` processes make those that are missing."""
+    """Records of all runs, in order; `jobs` processes execute the missing ones."""
     todo, clock = [run for run in runs if run.record(folder) is None], time.perf_counter()
-    print(f"{len(runs) - len(todo)} of {len(runs)} runs are there, {len(todo)} to make", flush=True)
+    print(f"{len(runs) - len(todo)} of {len(runs)} runs exist, {len(todo)} are missing", flush=True)
     with multiprocessing.get_context("spawn").Pool(jobs) if jobs > 1 else ThreadPool(jobs) as pool:
         records = pool.imap(functools.partial(execute, folder=folder), todo)
         for done, (run, record) in enumerate(zip(todo, records, strict=True), 1):
@@ -207,7 +211,7 @@ def execute_all(runs: list[Run], folder: Path, jobs: int) -> list[dict[str, Any]
 
 
 def report(table: pd.DataFrame) -> list[str]:
-    """The tables in Markdown: every kind and the paired differences per scene and noise; the differences over all scenes."""
+    """Tables in Markdown: every kind and paired differences per scene and noise, then differences over all scenes."""
 
     def cell(metric: str, values: pd.Series, sign: str) -> str:
         _, factor, digits = METRICS[metric]
@@ -234,14 +238,14 @@ def report(table: pd.DataFrame) -> list[str]:
             of = by.reindex([metric]).iloc[0]
             cells.append("{:+.{d}f} [{:+.{d}f}, {:+.{d}f}]".format(*(factor * of[["difference", "low", "high"]]), d=digits))
         rows.append(cells)
-    lines += ["", "Less springs, same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
+    lines += ["", "Difference to springs at the same scene, noise and seed [95 % bootstrap interval over scenes and seeds]:", ""]
     return lines + Table.of_texts(["kind", "noise [mm]", *headings], rows).markdown()
 
 
 def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
-    """Per scene: the truth and every fit at rest, colored by stiffness, and recovered against true stiffness.
+    """Figure with a row per scene: the truth and every fit at rest, colored by stiffness, and recovered over true stiffness.
 
-    `scenes` is scene -> kind -> stiffness [N] of the object springs; shown relative to the truth's geometric mean.
+    `scenes` is scene -> kind -> stiffness [N] of the object springs; it is shown relative to the truth's geometric mean.
     """
     figure, axes = plt.subplots(len(scenes), 5, figsize=(17, 2.9 * len(scenes) + 1), squeeze=False, layout="constrained")
     for row, (scene, kinds) in zip(axes, scenes.items(), strict=True):
@@ -281,7 +285,7 @@ def picture(scenes: dict[str, dict[str, np.ndarray]]) -> Figure:
 
 
 def main() -> None:
-    """Make what is missing, then write the tables and the picture."""
+    """Execute missing runs, then write the tables and the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
     parser.add_argument("--epochs", type=int, default=80)

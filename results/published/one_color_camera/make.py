@@ -1,17 +1,18 @@
-r"""The cost of one color camera, where the truth is known: synthetic scenes seen by three RGBD cameras, by one, by color alone.
+r"""The cost of one color camera on synthetic scenes with known truth: three RGBD cameras, one RGBD camera, one color camera.
 
     python -m results.published.one_color_camera.make make CAPTURES OUT       # captures of one camera, with and without depth
     python -m results.published.one_color_camera.make table OUT RESULTS --output TABLES
 
-CAPTURES is a folder of results of config/data/synthetic.yaml (`--until synthesize` is enough), whose scenarios have
-<scenario>/capture and its truth. OUT gets, per scene, SCENE_three (a link to the capture), SCENE_one and SCENE_color, and
-scenarios.tsv, for a run with
+CAPTURES is a folder of results of config/data/synthetic.yaml (`--until perceive` is enough) with <scenario>/capture and its
+truth. The six published scenes are synthetic_double_lift_cloth_1, synthetic_single_lift_cloth_4, synthetic_double_lift_sloth,
+synthetic_single_lift_zebra, synthetic_single_lift_rope and synthetic_single_push_rope_4. OUT gets SCENE_three (a link to the
+capture), SCENE_one and SCENE_color for each scene, and scenarios.tsv, for a run with
 
     --configfile config/data/color.yaml config/studies/one_color_camera.yaml \
     --config data_root=OUT scenario_table=OUT/scenarios.tsv scenarios="[$(tail -n +2 OUT/scenarios.tsv | cut -f1 | paste -sd,)]"
 
-TABLES/errors.csv has every number, TABLES/summary.md the tables: hands against the truth, the shape in frame 0 against the true
-surface, track errors of predictions in 3D.
+TABLES/errors.csv contains every error, TABLES/summary.md the means: controllers against the truth, the shape in frame 0 against the
+true surface, and track errors of predictions in 3D.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from neuspring.extensions.synthetic.truth import Truth, truth_of
 from neuspring.scenes.sources import read_scenarios
 
 ARMS = ("three", "one", "color")
-"""Three RGBD cameras, the first of them alone, and its color alone."""
+"""Three RGBD cameras, only the first of them, and only its color."""
 MM = 1e3
 
 
 def make(results: Path, out: Path) -> None:
-    """Captures of all arms, and the table of scenarios."""
+    """Write captures of all arms, and the table of scenarios."""
     rows = ["scenario\tsource\tcategory\tpath\tself_collision\tground"]
     known = read_scenarios(Path("config/scenarios.tsv"))
     out.mkdir(parents=True, exist_ok=True)
@@ -57,7 +58,7 @@ def make(results: Path, out: Path) -> None:
 
 
 def one_camera(capture: Capture, target: Path, *, depth: bool) -> Capture:
-    """A copy of a capture with its first camera alone."""
+    """Write a copy of a capture with only its first camera."""
     name = next(iter(capture.cameras))
     description = replace(
         capture.description, name=target.name, cameras=capture.description.cameras[:1], depth="measured" if depth else "none"
@@ -69,10 +70,9 @@ def one_camera(capture: Capture, target: Path, *, depth: bool) -> Capture:
 
 
 def hand_errors(truth: Truth, seen: Observations) -> tuple[float, float]:
-    """Mean distance, m, of the grips from those that move with the true hands, in all frames and in the last one.
+    """Mean error, m, of the motion of hands: over all frames, and in the last frame.
 
-    The grip of a hand is the mean of its controllers; the true one moves with the hand's pose from where that is in frame 0. So
-    nothing counts but motion.
+    A hand's position is the mean of its controllers. Its displacement from frame 0 is compared with that of the true hand.
     """
     poses, hands = truth.hand_poses[..., :3].astype(float), seen.controller_points.astype(float)
     nearest = cKDTree(poses[0]).query(hands[0])[1]
@@ -86,13 +86,13 @@ def hand_errors(truth: Truth, seen: Observations) -> tuple[float, float]:
 
 
 def shape_errors(truth: Truth, seen: Observations) -> tuple[float, float]:
-    """Mean distance, m, of surface nodes from the true surface in frame 0, and of the true surface from nodes."""
+    """Mean distance, m, in frame 0: of surface nodes from the true surface, and of the true surface from nodes."""
     surface, nodes = truth.surface(0), seen.nodes[: seen.surface_count]
     return float(cKDTree(surface).query(nodes)[0].mean()), float(cKDTree(nodes).query(surface)[0].mean())
 
 
 def collect(captures: Path, results: Path) -> pd.DataFrame:
-    """Tidy rows: scene, arm, method, seed, metric, value in mm."""
+    """All errors; columns scene, arm, method, seed, metric, value_mm."""
     rows: list[tuple[str, str, str, int, str, float]] = []
     for path in sorted(captures.glob("*_three")):
         scene, truth = path.name.removesuffix("_three"), truth_of(Capture.load(path.resolve()))
@@ -115,7 +115,7 @@ def collect(captures: Path, results: Path) -> pd.DataFrame:
 
 
 def summary(errors: pd.DataFrame) -> str:
-    """Markdown: mean over scenes of every metric, by arm and method."""
+    """Mean over scenes of every metric by method and arm, in Markdown."""
     means = errors.groupby(["metric", "method", "arm"])["value_mm"].mean().unstack("arm").reindex(columns=list(ARMS))
     rows = [
         [str(metric), str(method), *("–" if np.isnan(value) else f"{value:.1f}" for value in row)]

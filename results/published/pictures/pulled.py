@@ -1,8 +1,7 @@
-"""The front page's film of a twin that is pulled: `python -m results.published.pictures.pulled OUTPUT.gif`.
+"""The animation of a pulled twin: `python -m results.published.pictures.pulled OUTPUT.gif`.
 
-The twin that travels with the package hangs from its hand, which rises, while its head is pulled in a circle and let go, by
-the spring with which `neuspring play` pulls what the mouse holds. `neuspring draw film` draws its splats; one panel is kept, with a
-line from there to the mouse.
+The sample twin of the package hangs from its controllers, which rise. A spring pulls its head in a circle and releases it, as the
+mouse does in `neuspring play`. `neuspring draw film` draws its splats; one panel is kept, with a line from the head to the mouse.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from neuspring.draw.scene import ShownRun, ShownScene
 from neuspring.extensions.play.simulator import Simulator
 
 LEAST, RISE, WIDE, HIGH = 14, 0.10, 0.12, 0.07
-"""Frames after it was let go; how far the hand rises, and the mouse goes aside and up, m."""
+"""Frames after the release; rise of the controllers, and motion of the mouse sideways and up, m."""
 AZIMUTH, ELEVATION = 255.0, 20.0
 VIEW = ("--as", "splats", "--error", "none", "--width", "640", "--azimuth", str(AZIMUTH), "--elevation", str(ELEVATION))
 LINE = (220, 60, 30)
 PANEL, TOP = 322, 44
-"""First column and row of the picture of the twin in the film."""
+"""First column and row of the panel of the twin in the video."""
 
 
 def pulled(frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [F, N, 3], m, and the ends of the line from there to the mouse [F, 2, 3]; nan where the head is not held."""
+    """Nodes [F, N, 3], m, and the ends of the line from the head to the mouse [F, 2, 3], NaN after the release."""
     twin = ns.load_run().twin
     simulator = Simulator(twin)
     rest = simulator.positions.copy()
@@ -51,7 +50,7 @@ def pulled(frames: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pixels_of(positions: np.ndarray, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Where points [..., 3] lie in the panel of the film of positions [F, N, 3], px."""
+    """Pixels of points [..., 3] in the panel of the video of positions [F, N, 3]."""
     observations, frames = ns.load_run().observations, range(len(positions))
     scene = ShownScene.from_side(observations, [ShownRun("twin", positions)], frames, AZIMUTH, ELEVATION)
     left, top, right, bottom = scene.box
@@ -60,7 +59,7 @@ def pixels_of(positions: np.ndarray, points: np.ndarray, size: tuple[int, int]) 
 
 
 def main() -> None:
-    """Draw, crop, write."""
+    """Draw the video, crop it and write OUTPUT."""
     output, run = Path(sys.argv[1]), ns.load_run()
     assert run.trajectory is not None
     with tempfile.TemporaryDirectory() as name:

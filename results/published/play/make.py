@@ -1,7 +1,7 @@
-"""Pictures of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT`.
+"""Screenshots of the playground for its page: `python -m results.published.play.make RESULTS/SCENARIO OUTPUT`.
 
-A headless Chromium opens the page as a user does. The scenario should be synthetic, with splats, and have runs of `neuspring` and
-`baseline`; pictures of real footage are not for this repository.
+A headless Chromium opens the page. The scenario should be synthetic, with splats and runs of `neuspring` and `baseline`. Do not
+commit screenshots of real video.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from tests.support.browser import Browser
 from tests.support.pointing import WINDOW, pixel, pull, until
 
 QUALITY = 82
-"""JPEG's quality."""
+"""JPEG quality."""
 PATIENCE = 900.0
 SECONDS = 20
-"""Seconds that a picture is given."""
+"""Seconds to wait for a screenshot."""
 CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach((one) => one.click())"
 
 
 def main() -> None:
-    """Take all pictures."""
+    """Take all screenshots."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenario", type=Path)
     parser.add_argument("output", type=Path)
@@ -63,43 +63,43 @@ def recording(page: Page, browser: Browser, output: Path) -> None:
 
 
 def live(page: Page, browser: Browser, server, output: Path) -> None:
-    """A twin that is pulled too far."""
+    """A twin under a strong pull."""
     page.begin(page.player.runs[0])
-    one = page.live
-    assert one is not None
-    until(lambda: one.simulator.frame > 5, PATIENCE)
+    session = page.live
+    assert session is not None
+    until(lambda: session.simulator.frame > 5, PATIENCE)
     camera = next(iter(server.get_clients().values())).camera
-    x = one.simulator.positions
+    x = session.simulator.positions
     node = int(np.argmax(x[:, 2]))
     with pull(browser, *pixel(camera, x[node]), 120, -150):
-        until(lambda: one.simulator.grabbed >= 0, PATIENCE)
-        begun = one.simulator.frame
-        until(lambda: one.simulator.frame > begun + 25, PATIENCE)
+        until(lambda: session.simulator.grabbed >= 0, PATIENCE)
+        begun = session.simulator.frame
+        until(lambda: session.simulator.frame > begun + 25, PATIENCE)
         settle()
         save(browser, output / "live.jpg")
     page.end()
 
 
 def future_frame(page: Page) -> int:
-    """A frame some way behind the border."""
+    """A frame in the middle of the future."""
     clock = page.player.clock
     return min(clock.border + (clock.count - clock.border) // 2, clock.count - 1)
 
 
 def change(page: Page, **parts: bool) -> None:
-    """Switch what is shown."""
+    """Show or hide parts of the page."""
     for name, on in parts.items():
         page.parts[name].value = on
     page._changed()
 
 
 def settle() -> None:
-    """Wait until a browser that draws by software has drawn."""
+    """Wait until a browser with software rendering has drawn."""
     time.sleep(SECONDS)
 
 
 def save(browser: Browser, path: Path) -> None:
-    """The window as JPEG."""
+    """Save the window as JPEG."""
     picture = path.with_suffix(".png")
     browser.screenshot(picture)
     image = cv2.imread(str(picture))

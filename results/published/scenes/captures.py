@@ -1,17 +1,21 @@
-"""Captures of PhysTwin scenes with hands in space: points alone, film with hands, and both.
+"""Captures of PhysTwin scenes with controllers in space: points only, video with controllers, and both.
 
     python -m results.published.scenes.captures FOLDER OUTPUT [--films FOLDER] [--cases ...] [--force]
 
-Any folder below FOLDER is a case that has, in integers of 0.1 mm, controller.txt and landmarks.txt (a line per frame: its number,
-then points x y z; 0 0 0 of a landmark: not visible) and rest.txt (a line x y z per node of frame 0). Of each
+A case is any folder below FOLDER with these files, in integers of 0.1 mm:
 
-    OUTPUT/CASE_points   hands, nodes and annotated points alone; those of training frames teach the twin
-    OUTPUT/CASE_film     color of camera 0 and the hands; annotated points are for scoring alone
-    OUTPUT/CASE_both     color, hands, nodes and annotated points
+    controller.txt, landmarks.txt   one line per frame: its number, then points x y z; landmark 0 0 0: not visible
+    rest.txt                        one line x y z per node of frame 0
 
-is written, the last two where FOLDER of --films (that of `results.published.film22.films`) has a film of the case and
-tests/data/marks has marks. The world is that of the cameras: z = 0 is the table, up is -z. The split is the released one.
-A capture that is there is left alone without --force.
+Each case becomes
+
+    OUTPUT/CASE_points   controllers, nodes and annotated points; points of training frames are used for fits
+    OUTPUT/CASE_film     color of camera 0 and controllers; annotated points are only for scores
+    OUTPUT/CASE_both     color, controllers, nodes and annotated points
+
+The last two require a video in the folder of --films (as in `results.published.film22.films`) and annotations in
+tests/data/marks. The world is that of the cameras: z = 0 is the table, up is -z. The split is the released one. Existing captures
+are kept unless --force is given.
 """
 
 from __future__ import annotations
@@ -43,15 +47,15 @@ def folders_of(folder: Path) -> dict[str, Path]:
 
 
 def moving(path: Path) -> np.ndarray:
-    """Points [T, n, 3], counts, of a file with a line per frame. Raises ValueError where frames are not 0, 1, 2, ..."""
+    """Points [T, n, 3], counts, of a file with a line per frame. Raises ValueError if frames are not 0, 1, 2, ..."""
     rows = np.loadtxt(path, dtype=int, ndmin=2)
     if not np.array_equal(rows[:, 0], np.arange(len(rows))) or (rows.shape[1] - 1) % 3:
-        raise ValueError(f"{path}: a line per frame, from 0, of its number and points x y z is required")
+        raise ValueError(f"{path}: each line must contain the frame number, from 0, and points x y z")
     return rows[:, 1:].reshape(len(rows), -1, 3)
 
 
 def read_case(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hands [T, C, 3], annotated points [T, K, 3] (NaN: not visible) and nodes [N, 3] of a case, m."""
+    """Controllers [T, C, 3], annotated points [T, K, 3] (NaN: not visible) and nodes [N, 3] of a case, m."""
     hands, marked = moving(folder / FILES[0]), moving(folder / FILES[1])
     tracks = np.where((marked != 0).any(axis=2, keepdims=True), UNIT * marked, np.nan)
     nodes = np.unique(np.loadtxt(folder / FILES[2], dtype=int, ndmin=2), axis=0)
@@ -59,7 +63,7 @@ def read_case(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def described(case: str, name: str, frames: int) -> Description:
-    """Description of a capture of the points alone."""
+    """Description of a capture with points only."""
     row = released_cases().get(case)
     split = int(row["train_end"]) if row is not None and int(row["frames"]) == frames else None
     return Description(
@@ -78,7 +82,7 @@ def described(case: str, name: str, frames: int) -> Description:
 
 
 def write_points(folder: Path, output: Path, case: str) -> Capture:
-    """Write OUTPUT/CASE_points. Raises InputError or ValueError for what cannot be read."""
+    """Write OUTPUT/CASE_points. Raises InputError or ValueError for unreadable files."""
     hands, tracks, nodes = read_case(folder)
     name = f"{case}_points"
     writer = Writer(output / name, described(case, name, len(hands)))
@@ -89,11 +93,11 @@ def write_points(folder: Path, output: Path, case: str) -> Capture:
 
 
 def add_hands(film: Path, folder: Path, *, both: bool) -> Capture:
-    """Hands and annotated points beside a film; with `both` nodes too, and the points teach the twin."""
+    """Add controllers and annotated points to a capture of video; with `both` also nodes, and the points are used for fits."""
     made = Capture.load(film)
     hands, tracks, nodes = read_case(folder)
     if made.frame_count > len(hands):
-        raise ValueError(f"{folder}: {len(hands)} frames, but the film has {made.frame_count}")
+        raise ValueError(f"{folder}: must have at least {made.frame_count} frames, like the video; received {len(hands)}")
     kept = slice(made.frame_count)
     write(made.folder, Hands(hands[kept], NO_BOOLS, NO_INTS), nodes if both else nodes[:0])
     write_tracks(made.folder, tracks[kept])
@@ -105,11 +109,11 @@ def add_hands(film: Path, folder: Path, *, both: bool) -> Capture:
     return capture
 
 
-def told(capture: Capture) -> str:
-    """A line about a capture."""
+def summary_line(capture: Capture) -> str:
+    """One line that describes a capture."""
     space, tracks = read(capture), capture.tracks()
     assert space.hands is not None
-    words = f"{space.hands.points.shape[1]} hand points, {len(space.nodes)} nodes, {tracks.shape[1]} annotated points"
+    words = f"{space.hands.points.shape[1]} controllers, {len(space.nodes)} nodes, {tracks.shape[1]} annotated points"
     return f"{capture.folder.name}: {capture.frame_count} frames, training before {capture.train_end}, {words}"
 
 
@@ -118,30 +122,30 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--films", type=Path, help="folder with videos and cameras.json")
-    parser.add_argument("--cases", nargs="+", help="all that are there by default")
-    parser.add_argument("--force", action="store_true", help="write captures anew that are there")
+    parser.add_argument("--cases", nargs="+", help="default: all")
+    parser.add_argument("--force", action="store_true", help="write existing captures again")
     a = parser.parse_args()
     found = folders_of(a.folder)
     if not found or (missing := set(a.cases or ()) - set(found)):
-        parser.error(f"{a.folder} has no case {' '.join(sorted(missing)) if found else ''} with {', '.join(FILES)}")
+        parser.error(f"{a.folder}: must contain a case {' '.join(sorted(missing)) if found else ''} with {', '.join(FILES)}")
     films = cases_of(a.films) if a.films else []
     for case in a.cases or found:
         marked = bool(marks_of(case, CALIBRATED))
         if a.films and not (case in films and marked):
-            print(f"{case}: {'no marks' if case in films else 'no film'}, so points alone", flush=True)
+            print(f"{case}: no {'annotations' if case in films else 'video'}, so points only", flush=True)
         for row in ("points", *(("film", "both") if case in films and marked else ())):
             folder = a.output / f"{case}_{row}"
             if (folder / CAPTURE).exists() and not a.force:
-                print(f"{folder.name}: is there", flush=True)
+                print(f"{folder.name}: exists, kept", flush=True)
             elif row == "points":
-                print(told(write_points(found[case], a.output, case)), flush=True)
+                print(summary_line(write_points(found[case], a.output, case)), flush=True)
             elif row == "film":
                 write_capture(a.films, a.output, case, name=folder.name)
-                print(told(add_hands(folder, found[case], both=False)), flush=True)
+                print(summary_line(add_hands(folder, found[case], both=False)), flush=True)
             else:
                 shutil.rmtree(folder, ignore_errors=True)
                 shutil.copytree(a.output / f"{case}_film", folder)
-                print(told(add_hands(folder, found[case], both=True)), flush=True)
+                print(summary_line(add_hands(folder, found[case], both=True)), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Twins of the paper's own scenes beside PhysTwin's released errors, in millimeters: a table per scene, and errors over time.
+"""Errors of twins of the paper's scenes and PhysTwin's released errors, in mm: a table per scene, and errors over time.
 
     python -m results.published.scenes.make RESULTS --output OUT [--methods ...]
 
 RESULTS is a folder of results with scenarios CASE_points, CASE_film or CASE_both (`results.published.scenes.captures`).
-OUT/summary.md has the tables, OUT/scores.csv a row per run, OUT/CASE.png the errors by frame and by annotated point.
+OUT/summary.md contains the tables, OUT/scores.csv a row per run, OUT/CASE.png the errors by frame and by annotated point.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ ROWS = (CONFIG / "rows" / "ours.yaml",)
 MM = 1e3
 PHYSTWIN = "PhysTwin (released)"
 SEEN = {
-    "points": "the hands, 320 nodes and nine annotated points of training frames",
-    "film": "one color camera and the hands; annotated points are for scoring alone",
-    "both": "one color camera, the hands, 320 nodes and the annotated points of training frames",
+    "points": "the controllers, 320 nodes and nine annotated points of training frames",
+    "film": "one color camera and the controllers; annotated points are only for scores",
+    "both": "one color camera, the controllers, 320 nodes and the annotated points of training frames",
 }
-"""The input of methods, by the ending of the scenario's name."""
+"""End of the scenario's name -> input of the methods."""
 METRICS = {"track_error": "track error", "track_error_bound": "bound track error", "iou": "IoU"}
 TASKS = {"reconstruction": "training", "future": "future"}
 NOTE = """\
-Track errors in mm, as PhysTwin's evaluation measures them (the nearest node in frame 0), and bound to the nodes around (0 for every
-rigid motion). ±: standard deviation over seeds. Rows `..._pooled` saw the training frames of all scenes; `..._unseen` those
-of the others, and of this one frame 0 and the hands. PhysTwin had three RGBD cameras and dense tracks. Its numbers are those of its
-released evaluation of these frames. Nobody has compared our nine annotated points with the released file."""
+Track errors in mm, as in PhysTwin's evaluation (the nearest node in frame 0), and bound to the surrounding nodes (0 for every
+rigid motion). ±: standard deviation over seeds. `..._pooled` saw the training frames of all scenes; `..._unseen` saw those of the
+other scenes, and frame 0 and the controllers of this scene. PhysTwin had three RGBD cameras and dense tracks; its numbers are
+from its released evaluation of these frames. Our nine annotated points were not compared with the released file."""
 UNLEARNED = ("static", "controller_lbs")
-"""They learn nothing; their errors would flatten the pictures."""
+"""Methods that learn nothing; their errors would compress the figures."""
 COLUMNS = ["case", "saw", "method", "seed", "task", "metric", "value"]
 
 
 def cases(results: Path) -> dict[str, list[str]]:
-    """Case -> what methods saw, of the scenarios in a folder of results."""
+    """Case -> inputs of the methods, for the scenarios in a folder of results."""
     found: dict[str, list[str]] = {}
     for path in sorted(results.glob("*/observations.npz")):
         case, _, saw = path.parent.name.rpartition("_")
@@ -60,7 +60,7 @@ def cases(results: Path) -> dict[str, list[str]]:
 
 
 def scores(results: Path, methods: Sequence[str]) -> pd.DataFrame:
-    """A row per run, task and metric (`COLUMNS`); lengths in mm. PhysTwin's have the seed -1."""
+    """One row per run, task and metric (`COLUMNS`), lengths in mm. PhysTwin has the seed -1."""
     rows: list[dict[str, object]] = []
     for case, every in cases(results).items():
         for saw in every:
@@ -77,7 +77,7 @@ def scores(results: Path, methods: Sequence[str]) -> pd.DataFrame:
 
 
 def tables(scored: pd.DataFrame, methods: Sequence[str]) -> Iterator[str]:
-    """A table per case and evidence, each beside PhysTwin's line."""
+    """A table per case and input, with a row for PhysTwin."""
     pairs = [(metric, task) for metric in METRICS for task in TASKS]
     for (case, saw), part in scored[scored["saw"] != ""].groupby(["case", "saw"], sort=False):
         own = pd.concat([part, scored[(scored["case"] == case) & (scored["saw"] == "")]])
@@ -101,7 +101,7 @@ def _spread(values: pd.Series, shown: tuple[str, str]) -> str:
 
 
 def curves(results: Path, case: str, saw: str, methods: Sequence[str]) -> Figure:
-    """Errors of the annotated points, mm: their mean by frame, and each in the future; means over seeds of methods that learn."""
+    """Errors of the annotated points, mm: mean by frame, and each point in the future; means over seeds of methods that learn."""
     methods = [method for method in methods if method not in UNLEARNED]
     observed = Observations.load(results / f"{case}_{saw}" / "observations.npz")
     tracks, end = observed.tracks.astype(float), observed.scenario.train_end
@@ -140,7 +140,7 @@ def curves(results: Path, case: str, saw: str, methods: Sequence[str]) -> Figure
 
 
 def point_errors(trajectory: Trajectory, tracks: np.ndarray) -> np.ndarray:
-    """Error [T, K], m, of each track [T, K, 3] from its node, the nearest in frame 0; NaN where it is not annotated."""
+    """Error [T, K], m, of each track [T, K, 3] from the node that is nearest in frame 0; NaN without annotation."""
     from scipy.spatial import cKDTree
 
     positions, first = trajectory.positions.astype(float), np.isfinite(tracks[0]).all(axis=1)
@@ -156,7 +156,7 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("results", type=Path)
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--methods", nargs="+", help="all that have runs by default, in the order of config/methods.yaml")
+    parser.add_argument("--methods", nargs="+", help="default: all with runs, in the order of config/methods.yaml")
     a = parser.parse_args()
     from neuspring.experiments.benchmark import read_methods
 

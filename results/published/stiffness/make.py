@@ -1,10 +1,10 @@
-"""Twins of synthetic scenes beside the material that their bodies were made of.
+"""Correlation of a twin's stiffness with the true material of synthetic scenes.
 
     python -m results.published.stiffness.make RESULTS OUT [--methods ...] [--pictures SCENARIO ...]
 
-A body of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet), a twin a stiffness
-per spring. Around a node the twin has the geometric mean of its springs, the truth the modulus of the nearest element in frame 0.
-OUT/beside_truth.md has the correlation of their logarithms, mean over seeds; OUT/beside_truth.csv has a row per run, and
+An object of finite elements has a modulus per element (Young's modulus of a solid, membrane stiffness of a sheet); a twin has a
+stiffness per spring. At each node, the geometric mean of the twin's springs is compared with the modulus of the nearest element
+in frame 0. OUT/beside_truth.md contains the correlation of their logarithms, mean over seeds; OUT/beside_truth.csv a row per run.
 OUT/SCENARIO.png shows both, relative to the geometric mean over nodes.
 """
 
@@ -34,15 +34,15 @@ from neuspring.extensions.synthetic.truth import Truth, truth_path
 from neuspring.twin.body import body_of
 
 METHODS = ["search_only", "baseline_ten_frames", "model_b", "shuffled", "neuspring", "neuspring_plus", "baseline_plus"]
-NOTE = "Correlation of log stiffness around each node with the log modulus that the body was made of, mean over seeds."
+NOTE = "Correlation of log stiffness around each node with the log of the true modulus, mean over seeds."
 LEAST_SPREAD = 1e-6
-"""Standard deviation of logarithms below which everything is equal."""
+"""Standard deviation of logarithms below which values count as constant."""
 LIMITS = (0.2, 5.0)
 """Range of colors: stiffness over its geometric mean."""
 
 
 def modulus_at(truth: Truth, nodes: np.ndarray) -> np.ndarray:
-    """Modulus of the element whose center in frame 0 is nearest to each node [N], Pa; of a sheet N/m."""
+    """Modulus [N] of the element whose center in frame 0 is nearest to each node: Pa, for sheets N/m."""
     solid = len(truth.tetrahedra) > 0
     elements, values = (truth.tetrahedra, truth.youngs_modulus) if solid else (truth.triangles, truth.membrane)
     return np.asarray(values[cKDTree(truth.nodes[0][elements].mean(axis=1)).query(nodes)[1]], dtype=float)
@@ -57,13 +57,13 @@ def made_of(twin: Twin, modulus: np.ndarray) -> Twin:
 
 
 def relative(twin: Twin) -> Twin:
-    """The twin with stiffness over the geometric mean of its nodes'."""
+    """The twin with its stiffness over the geometric mean of its nodes' stiffness."""
     stiffness = twin.material.stiffness / np.exp(np.log(body_of(twin).node_stiffness(twin)).mean())
     return replace(twin, material=replace(twin.material, stiffness=stiffness.astype(np.float32)))
 
 
 def picture(scenario: str, takes: Sequence[ShownRun], scene: ShownScene) -> Figure:
-    """The truth and twins side by side, four in a row."""
+    """Figure of the truth and the twins, four per row."""
     rows, height = -(-len(takes) // 4), 4 * scene.view.height / scene.view.width
     figure, axes = plt.subplots(rows, 4, figsize=(16, rows * (height + 0.3) + 0.9), layout="constrained", squeeze=False)
     for axis in axes.flat:
@@ -89,7 +89,7 @@ def picture(scenario: str, takes: Sequence[ShownRun], scene: ShownScene) -> Figu
 
 
 def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, float]], list[ShownRun], ShownScene | None]:
-    """Judged runs of a scenario: (method, seed, correlation); the truth and a twin of each method at rest, and what shows them."""
+    """(method, seed, correlation) of the runs of a scenario; the truth and one twin per method; the scene for the figure."""
     truth, rows, takes, scene = Truth.load(truth_path(home / "capture")), [], dict[str, ShownRun](), None
     for path in (path for method in methods for path in sorted(home.glob(f"{method}/*/rollout.json"))):
         run = RunFolder.of(path.parent)
@@ -107,7 +107,7 @@ def judged(home: Path, methods: Sequence[str]) -> tuple[list[tuple[str, int, flo
 
 
 def main() -> None:
-    """Write the table, and a picture of each scene that is named."""
+    """Write the table, and a figure of each scene of --pictures."""
     parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path)
     parser.add_argument("output", type=Path)
@@ -128,7 +128,7 @@ def main() -> None:
     wide.loc["mean over scenes"] = wide.mean()
     cells = [[str(name), *(f"{r:.2f}" for r in row)] for name, row in wide.iterrows()]
     lines = Table.of_texts(["scene", *wide.columns], cells).markdown()
-    write_text(options.output / "beside_truth.md", "\n".join(["# Stiffness beside the truth", "", NOTE, "", *lines, ""]))
+    write_text(options.output / "beside_truth.md", "\n".join(["# Stiffness and truth", "", NOTE, "", *lines, ""]))
 
 
 if __name__ == "__main__":

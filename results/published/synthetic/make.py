@@ -1,4 +1,4 @@
-"""First, middle and last frame of every capture in a results folder, and what each took: disk, numerics.
+"""First, middle and last frame of every capture in a results folder, with its size and accuracy.
 
 python -m results.published.synthetic.make results/synthetic results/published/synthetic
 """
@@ -21,7 +21,7 @@ COLUMNS = 2
 
 
 def strip(capture: Capture) -> np.ndarray:
-    """Three frames of the first camera side by side, under the scene's name."""
+    """Three frames of the first camera side by side, below the name of the scene."""
     camera = next(iter(capture.cameras))
     frames = [0, capture.frame_count // 2, capture.frame_count - 1]
     images = [cv2.resize(capture.color(camera, frame), SIZE, interpolation=cv2.INTER_AREA) for frame in frames]
@@ -32,7 +32,7 @@ def strip(capture: Capture) -> np.ndarray:
 
 
 def facts(capture: Capture) -> dict[str, object]:
-    """The cost of a capture, from its files."""
+    """Size and numerical accuracy of a capture, from its files."""
     folder = capture.folder.parent
     truth = Truth.load(truth_path(capture.folder))
     size = sum(path.stat().st_size for path in capture.folder.rglob("*") if path.is_file())

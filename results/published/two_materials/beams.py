@@ -1,4 +1,4 @@
-"""A beam of the two-material study: its lattice, its equilibrium, and pictures of it with the pose of their camera."""
+"""A beam of the two-material study: its lattice, its equilibrium, and images with camera poses."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from neuspring.twin.losses import FrameLoss, ImageEvidence
 
 CM = 0.01
 TO_MARKER = np.array([-9.15, -3.5, -1.75])
-"""Place of the beam's CAD frame in the marker's frame, cm."""
+"""Origin of the beam's CAD frame in the marker's frame, cm."""
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""From the CAD frame, y up, to the simulator's world, z up."""
+"""Rotation from the CAD frame, y up, to the simulator's world, z up."""
 INTRINSICS = np.array([[902.5, 0.0, 653.2], [0.0, 903.7, 363.3], [0.0, 0.0, 1.0]])
 SIDE = 0.020
 """Side of the marker, m."""
 DENSITY, GRAVITY = 1080.0, 9.81
 HALF, HEAD, THICK = 10.0, 7.0, 1.5
-"""Half lengths, cm: of the beam, of the part between its heads, of its thickness; heads are twice as high."""
+"""Half length of the beam, of its part between the heads, and half thickness, cm; heads are twice as high."""
 CELLS = 4
 """Cells of the lattice across the thickness."""
 REACH = 1.55
-"""Radius of neighbors in spacings: along sides and diagonals of faces. E over G along the axes is 2.96; of silicone 3."""
+"""Largest spring length in spacings: sides and face diagonals. E / G along the axes is 2.96, of silicone 3."""
 CORNER, INDEPENDENT = 0.3, 50
-"""Deviation of a corner of the marker, pixels; points of a silhouette that count as independent measurements."""
+"""Standard deviation of a marker corner, px; number of independent points of a silhouette."""
 BAND = 15.0
-"""Width of the part of a silhouette that is compared, pixels from its outline: within it nothing is learned."""
+"""Compared width of a silhouette from its outline, px; pixels further inside add no information."""
 HIDDEN = 6.0
-"""Nearer to a clamp than this, cm, nothing is compared: it mirrors the beam and hides it."""
+"""Distance to a clamp within which nothing is compared, cm: a clamp mirrors and hides the beam."""
 COLLAPSED = 0.65
-"""Length over rest length below which a lattice has folded into itself: the next equilibrium is sought from the rest shape."""
+"""Length over rest length below which a lattice is folded; the next equilibrium then starts from the rest shape."""
 
 
 class Beam:
@@ -73,7 +73,7 @@ class Beam:
         self.surface, self.faces = _finer(*_finer(vertices, faces))
         self.carried = self._weights(number, self.surface)
         x, y = self.nodes[:, 0], np.abs(self.nodes[:, 1])
-        # A clamp holds a head by its walls; the beam leaves it through a window, so that the material inside gives way a little.
+        # A clamp holds the walls of a head; the material at its window can deform a little.
         walls = (y > 2 * THICK - 0.1) | (np.abs(x) > HALF - 0.1) | ((np.abs(x) < HEAD + 0.1) & (y > THICK + 0.1))
         self.clamps = [walls & (x > HEAD - 0.1), walls & (x < 0.1 - HEAD)]
 
@@ -101,7 +101,7 @@ def _within(axes: Sequence[np.ndarray], margin: float) -> np.ndarray:
 
 
 def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each triangle in four."""
+    """Divide each triangle into four."""
     edges, inverse = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2), axis=0, return_inverse=True)
     a, b, c, (ab, bc, ca) = *faces.T, len(vertices) + inverse.reshape(-1, 3).T
     parts = [np.stack(corners, axis=1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
@@ -109,7 +109,7 @@ def _finer(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def world(points: np.ndarray) -> np.ndarray:
-    """From the CAD frame, cm, to the marker's with z up, m."""
+    """Points from the CAD frame, cm, in the marker's frame with z up, m."""
     return np.asarray(CM * (points + TO_MARKER) @ UP.T)
 
 
@@ -154,7 +154,7 @@ class Held:
         return np.asarray(self._spread @ force - GRAVITY * self._mass * [0.0, 0.0, 1.0])
 
     def _solved(self, stiffness: np.ndarray, right: np.ndarray, *, exact: bool) -> np.ndarray:
-        """K^-1 b for b [N, 3]; without the stress of compressed springs, which may make K indefinite, unless `exact`."""
+        """K^-1 b for b [N, 3]. Without `exact`, K omits the stress of compressed springs, which can make K indefinite."""
         ratio, d = self._springs()
         along, outer = stiffness / self._scene.rest_lengths, d[:, :, None] * d[:, None, :]
         across = along * (1 - 1 / ratio if exact else np.maximum(1 - 1 / ratio, 0.0))
@@ -174,7 +174,7 @@ class Held:
         return float(stored.sum() + GRAVITY * (self._mass[:, 0] * self.x[:, 2]).sum())
 
     def settle(self, stiffness: np.ndarray) -> np.ndarray:
-        """All nodes of the beam [N, 3], m, where forces are in balance (Newton, line search). Raises NumericalFailure."""
+        """All nodes of the beam [N, 3], m, in equilibrium (Newton, line search). Raises NumericalFailure without convergence."""
         if self._springs()[0].min() < self.folded:
             self.x = self.rest
         weight = GRAVITY * float(self._mass.sum())
@@ -194,17 +194,17 @@ class Held:
                 part /= 2
                 self.x = start + part * step
         else:
-            raise NumericalFailure(f"no equilibrium: {largest:.1e} of the weight is not balanced")
+            raise NumericalFailure(f"no equilibrium: a force of {largest:.1e} of the weight remains")
         return self.placed(self.x)
 
     def placed(self, x: np.ndarray) -> np.ndarray:
-        """All nodes of the beam [N, 3], m, those that are held with them."""
+        """All nodes of the beam [N, 3], m, including held nodes."""
         nodes = np.empty((len(self.free) + len(self.held), 3))
         nodes[self.free], nodes[self.held] = x, self.hands
         return nodes
 
     def pulled_back(self, stiffness: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Derivative by stiffness [S] from that by all nodes [N, 3], in equilibrium: K dx = df/dY dY."""
+        """Derivative by stiffness [S] from that by all nodes [N, 3]; in equilibrium K dx = df/dY dY."""
         adjoint = self._solved(stiffness, gradient[self.free], exact=True)
         ratio, d = self._springs()
         return np.asarray(((self._spread.T @ adjoint) * d).sum(axis=1) * (ratio - 1))
@@ -225,7 +225,7 @@ class Equilibrium(torch.autograd.Function):
 
 
 def silhouette_of(picture: np.ndarray) -> np.ndarray:
-    """The largest piece of saturated red or blue [H, W]; a dark line where they meet is filled."""
+    """Largest component of saturated red or blue [H, W]; the dark line between the colors is filled."""
     hue, saturation, value = (channel.astype(int) for channel in cv2.split(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)))
     colored = ((hue >= 165) | (hue <= 5) | ((hue >= 88) & (hue <= 112))) & (saturation > 120) & (value > 40)
     closed = cv2.morphologyEx(colored.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
@@ -234,10 +234,10 @@ def silhouette_of(picture: np.ndarray) -> np.ndarray:
 
 
 class View:
-    """A picture: its silhouette, the pose of its camera by the marker's corners, and the part that is compared."""
+    """An image: its silhouette, the pose of its camera from the marker's corners, and the compared pixels."""
 
     def __init__(self, beam: Beam, picture: Path, pose: Any, ends: tuple[int, ...] = (1,)) -> None:
-        """`pose` [4, 4] of the marker in the camera, by which corners are found; `ends`: signs of x of the clamps."""
+        """`pose` [4, 4]: marker in the camera, to find its corners; `ends`: signs of x of the clamps."""
         image = cv2.imread(str(picture))
         self.beam, self.name, self.mask = beam, picture.stem, silhouette_of(image)
         flat = SIDE / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
@@ -269,14 +269,14 @@ class View:
         self._carried = torch.sparse_coo_tensor(np.stack(carried.coords), carried.data, carried.shape, check_invariants=True)
 
     def seen(self, points: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Points [P, 3] of the world in a camera that is turned and moved by q [6], degrees and mm, from the marker's pose."""
+        """Points [P, 3] of the world in a camera that q [6], degrees and mm, rotates and moves from the marker's pose."""
         a, b, c = torch.deg2rad(q[:3])
         zero = torch.zeros_like(a)
         skew = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)
         return points @ (torch.linalg.matrix_exp(skew) @ torch.tensor(self.turn)).T + torch.tensor(self.place) + 1e-3 * q[3:]
 
     def loss(self, points: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Squared pixels: the silhouette's of the shown points of the surface [P, 3], and the marker's corners."""
+        """Loss in squared pixels of the shown surface points [P, 3] (silhouette) and of the marker's corners."""
         back = (self.seen(points, q) - torch.tensor(self.place)) @ torch.tensor(self.turn)
         marker = self.seen(torch.tensor(self.square), q) @ torch.tensor(INTRINSICS).T
         corners = (marker[:, :2] / marker[:, 2:] - torch.tensor(self.corners)) / CORNER
@@ -284,11 +284,11 @@ class View:
         return self._loss(0, back) / self._loss.image.size**2 + corners.square().sum() / INDEPENDENT
 
     def of_nodes(self, nodes: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """`loss` of the nodes of a lattice [N, 3]."""
+        """`loss` for the nodes of a lattice [N, 3]."""
         return self.loss(self._carried @ nodes, q)
 
     def drawn(self, surface: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Predicted silhouette [H, W] of all points of the surface [P, 3]."""
+        """Predicted silhouette [H, W] of all surface points [P, 3]."""
         pixels = _projected(self.seen(torch.from_numpy(surface), torch.from_numpy(q)).numpy())
         result = np.zeros(self.mask.shape, np.uint8)
         for triangle in np.round(16 * pixels[self.beam.faces]).astype(np.int32):
@@ -296,7 +296,7 @@ class View:
         return result > 0
 
     def scores(self, surface: np.ndarray, q: np.ndarray) -> dict[str, float]:
-        """IoU, and mean distance of the two outlines, pixels, where they are compared."""
+        """IoU, and mean distance of the two outlines in px, on compared pixels."""
         counted = self.counted > 0
         masks = [self.mask & counted, self.drawn(surface, q) & counted]
         edges = [cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) for m in masks]
@@ -311,18 +311,18 @@ def _projected(local: np.ndarray) -> np.ndarray:
 
 
 def views_of(beam: Beam, folder: Path, pattern: str, ends: tuple[int, ...] = (1,)) -> list[View]:
-    """The pictures of a folder, or of its folder images, with a pose in views.json; a folder without any is an error."""
+    """Images of a folder or of its folder images with a pose in views.json. Exits with an error without such images."""
     known = {
         name: pose for each in json.loads((folder / "views.json").read_text()).values() for name, pose in each["images"].items()
     }
     pictures = sorted(path for path in [*folder.glob(pattern), *folder.glob(f"images/{pattern}")] if path.name in known)
     if not pictures:
-        raise SystemExit(f"{folder}: no picture {pattern} with a pose in views.json")
+        raise SystemExit(f"{folder}: must contain an image {pattern} with a pose in views.json")
     return [View(beam, path, known[path.name], ends) for path in pictures]
 
 
 def posed(view: View, nodes: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-    """The pose [6] of the camera for nodes [N, 3], and the loss."""
+    """Pose [6] of the camera for nodes [N, 3], and the loss."""
     points = view._carried @ torch.from_numpy(nodes)
 
     def value(p: np.ndarray) -> tuple[float, np.ndarray]:

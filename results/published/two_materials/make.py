@@ -1,16 +1,17 @@
-"""Stiffness found from silhouettes of beams of one and of two silicones, beside what is known of it (data of DiffCal, CGF 2023).
+"""Stiffness from silhouettes of beams of one and of two silicones with a known ratio (data of DiffCal, CGF 2023).
 
-    python -m results.published.two_materials.make hanging DATA OUT [--rows ...]       # fits, a row of OUT/fits.csv each
+    python -m results.published.two_materials.make hanging DATA OUT [--rows ...]       # fits, one row of OUT/fits.csv each
     python -m results.published.two_materials.make tables DATA OUT                     # OUT/summary.md, OUT/stiffness.png
     python -m results.published.two_materials.make twisted FOLDER OUT [--cad DATA/cad] [--pictures "t_em_c__*.png"]
 
-`twisted` predicts by the fits in OUT of `hanging`; OUT/twisted.md has all rows, OUT/twisted.csv every one.
-DATA has images/, views.json and cad/ of the beams; FOLDER has pictures of twisted beams and their views.json. The beam is a lattice
-of the project, whose planes meet its faces and whose surface is the CAD's. Its equilibrium is found by Newton's method, to which
-a damped rollout of the simulator agrees within 1e-3 mm, and gradients are those of the balance of forces. The loss is the
-project's term `silhouette`, in squared pixels. A picture's pose comes from its marker's corners, found anew since the poses of
-views.json turn by 1 to 30 degrees between pictures of a camera that stands still. It is fitted with the stiffness, and the corners
-hold it by 0.3 pixels.
+DATA contains images/, views.json and cad/ of the beams; FOLDER contains images of twisted beams and their views.json. `twisted`
+predicts with the fits of `hanging` in OUT; OUT/twisted.csv has a row per prediction, OUT/twisted.md the means.
+
+The beam is a lattice whose planes meet the faces of the beam; its surface is that of the CAD file. Newton's method finds the
+equilibrium (a damped rollout of the simulator agrees within 1e-3 mm); gradients follow from the balance of forces. The loss is
+the term `silhouette` of the package, in squared pixels. The pose of an image is computed from its marker's corners, because poses
+in views.json differ by 1 to 30 degrees for a fixed camera. It is fitted together with the stiffness, with a deviation of 0.3
+pixels for corners.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ TRUTH = 2.5
 
 
 class Found(dict[str, Any]):
-    """A row of fits.csv, with the stiffness of springs or the modulus of joints by place, and the surface that it predicts."""
+    """A row of fits.csv, with stiffness of springs or modulus of joints by position, and the predicted surface."""
 
     place: np.ndarray
     """x of springs or joints [S], cm."""
@@ -69,7 +70,7 @@ class Found(dict[str, Any]):
 
     @classmethod
     def of(cls, view: View, loss: float, place: np.ndarray, values: np.ndarray, surface: np.ndarray, q: np.ndarray) -> Found:
-        """The row of a fit: means are geometric, over what lies between the heads."""
+        """The row of a fit, with geometric means between the heads."""
         logs, between = np.log(values), np.abs(place) < HEAD
         left, right = between & (place < 0), between & (place > 0)
         means = logs[left].mean(), logs[right].mean()
@@ -82,13 +83,13 @@ class Found(dict[str, Any]):
 
 
 UNIT = 0.1
-"""Logarithm of stiffness that is as much as a degree or a millimeter of the pose."""
+"""Change of log stiffness with the same scale as a degree or a millimeter of the pose."""
 Law = Callable[[torch.Tensor], torch.Tensor]
-"""From variables [P] to the logarithm of stiffness [S]."""
+"""Maps variables [P] to log stiffness [S]."""
 
 
 def descended(view: View, held: Held, law: Law, start: Sequence[float], q: np.ndarray) -> tuple[np.ndarray, Found]:
-    """A few variables and the pose, by L-BFGS from `start` [P] and q [6]; small steps, where nearest points change, end it."""
+    """Fit variables and pose by L-BFGS from `start` [P] and q [6]; it ends at small steps, where nearest points change."""
     count = len(start)
 
     def value(p: np.ndarray) -> tuple[float, np.ndarray]:
@@ -108,12 +109,12 @@ def descended(view: View, held: Held, law: Law, start: Sequence[float], q: np.nd
 
 
 def uniform(held: Held) -> Law:
-    """One stiffness."""
+    """One stiffness for all springs."""
     return lambda p: p[0].expand(len(held.kept))
 
 
 def regional(held: Held, boundary: float | None = 0.0) -> Law:
-    """Two stiffnesses, beyond and before a place along the beam, cm; None: the place is a variable, the third."""
+    """Two stiffnesses, on both sides of `boundary` [cm] along the beam; None: the boundary is the third variable."""
     x = torch.tensor(held.beam.middles[held.kept, 0])
     width = 2 * THICK / CELLS
 
@@ -125,11 +126,11 @@ def regional(held: Held, boundary: float | None = 0.0) -> Law:
 
 
 STEPS = 120
-"""Steps of Adam, as many as bring the loss to rest."""
+"""Steps of Adam; the loss is constant after them."""
 
 
 def trained(view: View, held: Held, kind: str, seed: int, start: float, q: np.ndarray) -> Found:
-    """A number per spring, or a field, by Adam with the project's settings for ten frames, from a uniform stiffness, N."""
+    """Fit a value per spring or a field by Adam, with the settings for ten frames, from a uniform stiffness [N]."""
     field = config.SpringFieldSettings(shuffled=kind == "shuffled", plane_learning_rate=0.01)
     rate = 0.03 if kind == "springs" else 0.001
     settings = config.Fit(learning_rate=rate, factor_learning_rate=0.01, output_bound=1.5, global_stiffness=True, field=field)
@@ -152,15 +153,15 @@ def trained(view: View, held: Held, kind: str, seed: int, start: float, q: np.nd
 
 
 VERTICES, KNOTS = 21, np.array([-7.0, -3.5, 0.0, 3.5, 7.0])
-"""Vertices of the rod; places of its knots, cm."""
+"""Vertices of the rod; positions of its knots, cm."""
 STEP = 0.002
-"""Step of differences in the logarithm of a modulus."""
+"""Step of finite differences in the log of a modulus."""
 ROOT = 0.5
-"""Place of the rod's clamp behind the face of the beam's, cm, chosen on the beams of one material: a head gives way a little."""
+"""Position of the rod's clamp behind the face of the head, cm, chosen on the beams of one material (a head deforms)."""
 
 
 def rods(beam: Beam, moduli: np.ndarray) -> torch.Tensor:
-    """Surfaces in equilibrium [B, P, 3], m, of rods whose moduli at the knots are exp(moduli) [B, 5], Pa."""
+    """Surfaces in equilibrium [B, P, 3], m, of rods with moduli exp(moduli) [B, 5], Pa, at the knots."""
     edge = (HEAD + ROOT + HALF) / (VERTICES - 1.5)
     x = HEAD + ROOT + edge * (0.5 - np.arange(VERTICES))
     height = 2 * THICK * np.where(np.abs(x) > HEAD, 2.0, 1.0)
@@ -202,7 +203,7 @@ def rods(beam: Beam, moduli: np.ndarray) -> torch.Tensor:
 
 
 def of_rod(view: View, start: np.ndarray, q: np.ndarray, *, even: bool) -> Found:
-    """A rod with one modulus, or one per knot; derivatives by differences, all rods side by side."""
+    """Fit a rod with one modulus or one per knot; finite differences, all rods in one batch."""
     directions = np.ones((1, len(KNOTS))) if even else np.eye(len(KNOTS))
     shown = view.shown
 
@@ -224,15 +225,15 @@ def of_rod(view: View, start: np.ndarray, q: np.ndarray, *, even: bool) -> Found
 
 
 BEAMS = {"h_e_c": ("Ecoflex", 1.8), "h_m_c": ("MoldStar", 4.8), "h_em_c": ("both", 2.2)}
-"""Experiments: what they are made of, and a stiffness to start from, N."""
+"""Experiment -> material, and initial stiffness, N."""
 PER_SPRING = ("springs", "field", "shuffled")
-"""Rows whose stiffness differs from spring to spring."""
+"""Methods with a stiffness per spring."""
 RATIOS = (1.5, 2.0, 2.5, 3.5, 6.0)
-"""Ratios at which the loss is asked for."""
+"""Ratios at which the loss is evaluated."""
 
 
 def young_per_newton(beam: Beam) -> float:
-    """Young's modulus, Pa, of a slender beam that sags by small loads as much as one of springs of 1 N: M / EI and V / (5/6 GA)."""
+    """Young's modulus, Pa, of a beam that sags as much as one with springs of 1 N, by M / EI and V / (5/6 GA)."""
     stiff, held = 1e3, Held(beam, beam.nodes[:, 0] > HEAD - 0.1)
     line = (np.abs(beam.nodes[:, 1:]).max(axis=1) < 1e-6) & (np.abs(beam.nodes[:, 0] + HEAD) < 1e-6)
     sag = (world(beam.nodes) - held.settle(np.full(len(held.kept), stiff)))[line, 2].item()
@@ -245,7 +246,7 @@ def young_per_newton(beam: Beam) -> float:
 
 
 def hanging(data: Path, out: Path, cad: Path, only: Sequence[str]) -> None:
-    """All fits; those that are in OUT/fits.csv are not made again. OUT/springs has the springs of rows `PER_SPRING`, N."""
+    """Make all fits that are missing in OUT/fits.csv. OUT/springs has the stiffness of `PER_SPRING` methods, N."""
     beam = Beam(cad)
     held, path = Held(beam, beam.clamps[0]), out / "fits.csv"
     done: list[dict[Hashable, Any]] = pd.read_csv(path, dtype={"start": str}).to_dict("records") if path.exists() else []
@@ -274,7 +275,7 @@ def hanging(data: Path, out: Path, cad: Path, only: Sequence[str]) -> None:
 def rows_of(
     view: View, held: Held, name: str, first: float, number: int, alone: pd.Series
 ) -> list[tuple[str, str, Callable[[], Found]]]:
-    """Fits of a picture: row, start or seed, and what makes it. `alone` has the stiffness of beams of one material, by name."""
+    """Fits of an image: method, start or seed, and function. `alone`: stiffness of beams of one material, by name."""
     still, log = np.zeros(6), float(np.log(first))
     even, known = uniform(held), regional(held)
 
@@ -313,19 +314,19 @@ def rows_of(
 
 
 def from_uniform(view: View, held: Held, kind: str, seed: int, log: float) -> Found:
-    """A fit of springs or a field from the best uniform stiffness and its pose."""
+    """Fit springs or a field from the best uniform stiffness and its pose."""
     p, found = descended(view, held, uniform(held), [log], np.zeros(6))
     return trained(view, held, kind, seed, float(np.exp(p[0])), found.q)
 
 
 TURN = 180.0
-"""Turn of the second clamp about x, degrees, as the authors' simulation has it; its sense is that of the edges in t_e_c."""
+"""Rotation of the second clamp about x, degrees, as in the authors' simulation; its sign is from the edges in t_e_c."""
 DRAWN = 10.0
-"""Turn in a step of the way there, degrees."""
+"""Rotation per step towards `TURN`, degrees."""
 
 
 class Twisted(Held):
-    """A beam between two clamps, the second turned about the beam's axis and moved along it."""
+    """A beam between two clamps; the second rotates about the beam's axis and moves along it."""
 
     folded = 0.0
 
@@ -334,7 +335,7 @@ class Twisted(Held):
         self._turn = self._shift = 0.0
 
     def twist(self, turn: float, shift: float, stiffness: np.ndarray) -> np.ndarray:
-        """All nodes in equilibrium [N, 3], m, with the second clamp turned, degrees, and moved away by `shift`, mm."""
+        """All nodes in equilibrium [N, 3], m, with the second clamp rotated by `turn`, degrees, and moved away by `shift`, mm."""
         count = max(int(np.ceil(max(abs(turn - self._turn) / DRAWN, abs(shift - self._shift) / 2))), 1)
         for part in np.linspace(0, 1, count + 1)[1:]:
             angle = np.radians(self._turn + part * (turn - self._turn))
@@ -352,11 +353,10 @@ class Twisted(Held):
 
 
 def twisted(folder: Path, out: Path, cad: Path, pattern: str) -> None:
-    """Predicted silhouettes of twisted beams, by fits of hanging ones: OUT/twisted.csv, OUT/twisted.md, OUT/twisted/PICTURE.png.
+    """Predict silhouettes of twisted beams from hanging fits; write OUT/twisted.csv, OUT/twisted.md, OUT/twisted/IMAGE.png.
 
-    The second clamp is turned by `TURN` and not moved (`given`), or both are fitted to the picture (`fitted`), since no marker is
-    on it. Stiffness is not fitted: it is that of OUT/fits.csv and OUT/springs. `swapped` is the control in which the halves change
-    places.
+    The second clamp has no marker. It is rotated by `TURN` and not moved (`given`), or both values are fitted to the image
+    (`fitted`). Stiffness is that of OUT/fits.csv and OUT/springs. `swapped` is a control with exchanged halves.
     """
     beam, fits = Beam(cad), pd.read_csv(out / "fits.csv")
     mean, lines = fits.groupby(["beam", "row"])[["left", "right"]].mean(), list[dict[str, Any]]()
@@ -382,12 +382,12 @@ def twisted(folder: Path, out: Path, cad: Path, pattern: str) -> None:
     rows = [[ROWS.get(str(row), str(row)), *(f"{outline:.1f}" for outline in own)] for row, *own in means.itertuples()]
     head = ["twin", *(f"outline [px], second clamp {clamp}" for clamp in means)]
     write_text(
-        out / "twisted.md", "\n".join(["# Twisted, mean over pictures and fits", "", *Table.of_texts(head, rows).markdown(), ""])
+        out / "twisted.md", "\n".join(["# Twisted, mean over images and fits", "", *Table.of_texts(head, rows).markdown(), ""])
     )
 
 
 def known_of(beam: Beam, mean: pd.DataFrame, springs: Path, made: str) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Row, fit and stiffness of all springs [S], N, by fits of the hanging beam `made`: means of halves, then each fit's own."""
+    """Method, fit and stiffness [S], N, from fits of the hanging beam `made`: means of halves, then each fit of springs."""
     part = np.clip(beam.middles[:, 0] * CELLS / (2 * THICK) + 0.5, 0, 1)
     for row in ("regions", "uniform", "swapped") if made == "h_em_c" else ("uniform",):
         left, right = mean.loc[(made, "regions" if row == "swapped" else row)][:: -1 if row == "swapped" else 1]
@@ -398,15 +398,15 @@ def known_of(beam: Beam, mean: pd.DataFrame, springs: Path, made: str) -> Iterat
 
 
 Clamped = tuple[float, float, np.ndarray, np.ndarray, float]
-"""Turn of the second clamp, degrees, and its shift, mm, nodes [N, 3], m, pose [6], and the loss."""
+"""Rotation [degrees] and shift [mm] of the second clamp, nodes [N, 3], m, pose [6], loss."""
 
 
 SIZES = (1.0, 0.4, 0.2)
-"""Of steps to the second clamp's place, one after the other, over 4 mm and 10 degrees."""
+"""Successive step sizes for the second clamp, in units of 4 mm and 10 degrees."""
 
 
 def second_clamp(view: View, held: Twisted, stiffness: np.ndarray, best: Clamped) -> Clamped:
-    """The place of the second clamp with the lowest loss, axis by axis in steps that shrink."""
+    """Pose of the second clamp with the lowest loss, by a coordinate search with shrinking steps."""
     for size in SIZES:
         for axis, step in ((1, 4.0), (0, 10.0), (1, 4.0), (0, 10.0)):
             tried = [best]
@@ -419,7 +419,7 @@ def second_clamp(view: View, held: Twisted, stiffness: np.ndarray, best: Clamped
 
 
 def drawn(view: View, surface: np.ndarray, q: np.ndarray, path: Path) -> None:
-    """The predicted silhouette in gray and the outline seen, in the part that is compared; no picture."""
+    """Draw the predicted silhouette (gray) and the observed outline on compared pixels, without the image."""
     picture = np.full((*view.mask.shape, 3), 255, np.uint8)
     picture[view.drawn(surface, q)] = 200
     picture[view.counted == 0] = picture[view.counted == 0] // 2 + 90
@@ -431,9 +431,9 @@ def drawn(view: View, surface: np.ndarray, q: np.ndarray, path: Path) -> None:
 
 ROWS = {
     "uniform": "one stiffness",
-    "predicted": "predicted: stiffness of the beams of one material, pose alone fitted",
+    "predicted": "predicted: stiffness of the beams of one material, only the pose fitted",
     "regions": "two regions, boundary known",
-    "regions_sought": "two regions, boundary sought (PT)",
+    "regions_sought": "two regions, boundary fitted (PT)",
     "springs": "free springs",
     "field": "field (tri-plane)",
     "shuffled": "`shuffled` field",
@@ -443,18 +443,15 @@ ROWS = {
 
 
 def step_in(part: pd.DataFrame) -> float:
-    """Correlation of log stiffness by place with what is known: one step at the middle."""
+    """Correlation of log stiffness along the beam with a step at the middle, the truth."""
     logs = np.log(part["stiffness"])
     return float(np.corrcoef(logs, part["x"] < 0)[0, 1]) if logs.std() > 1e-6 else np.nan
 
 
 def tables(out: Path, cad: Path) -> None:
-    """OUT/summary.md and OUT/stiffness.png from OUT/fits.csv and OUT/along.csv."""
-    fits, along, unit = (
-        pd.read_csv(out / "fits.csv"),
-        pd.read_csv(out / "along.csv", dtype={"start": str}),
-        young_per_newton(Beam(cad)) / 1e3,
-    )
+    """Write OUT/summary.md and OUT/stiffness.png from OUT/fits.csv and OUT/along.csv."""
+    fits, along = pd.read_csv(out / "fits.csv"), pd.read_csv(out / "along.csv", dtype={"start": str})
+    unit = young_per_newton(Beam(cad)) / 1e3
     fits = fits[fits["row"].isin([*ROWS, "given_ratio"])]
 
     def span(values: pd.Series, digits: int) -> str:
@@ -467,7 +464,7 @@ def tables(out: Path, cad: Path) -> None:
         moduli = part["left"] * unit if row == "uniform" else part["left"] / 1e3
         springs = span(part["left"], 2) if row == "uniform" else "–"
         rows.append([BEAMS[str(name)][0], ROWS[str(row)], springs, span(moduli, 0), span(part["outline"], 2), span(part["iou"], 3)])
-    lines = ["# Two silicones", "", "## Beams of one material: mean over three pictures (least to largest)", ""]
+    lines = ["# Two silicones", "", "## Beams of one material: mean over three images (least to largest)", ""]
     lines += Table.of_texts(["beam", "twin", "stiffness of a spring [N]", "E [kPa]", "outline [px]", "IoU"], rows).markdown()
     for row, part in alone.groupby("row", sort=False):
         means = part.groupby("beam")["left"].mean()
@@ -487,7 +484,7 @@ def tables(out: Path, cad: Path) -> None:
         ["twin", "fits", "ratio", "r, springs", "r, slices of 1 cm", "loss [px²]", "outline [px]", "IoU"], rows
     ).markdown()
     given = both[both["row"] == "given_ratio"].sort_values("ratio")
-    lines += ["", "## Loss over the ratio, everything else fitted, one picture", ""]
+    lines += ["", "## Loss over the ratio, other variables fitted, one image", ""]
     lines += Table.of_texts(
         ["ratio", *(f"{r:g}" for r in given["ratio"])], [["loss [px²]", *(f"{v:.2f}" for v in given["loss"])]]
     ).markdown()
@@ -510,14 +507,14 @@ def tables(out: Path, cad: Path) -> None:
 
 
 def main() -> None:
-    """The three commands."""
+    """Run one of the three commands."""
     parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("hanging", "tables", "twisted"))
-    parser.add_argument("folder", type=Path, help="with views.json and pictures, there or in images/")
+    parser.add_argument("folder", type=Path, help="folder with views.json and images, there or in images/")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--cad", type=Path, help="folder of the beams' shapes; FOLDER/cad where it is left out")
-    parser.add_argument("--rows", nargs="*", default=[], help="hanging: only these")
-    parser.add_argument("--pictures", default="t_*_c__*.png", help="twisted: names of pictures")
+    parser.add_argument("--cad", type=Path, help="folder of the CAD files (default: FOLDER/cad)")
+    parser.add_argument("--rows", nargs="*", default=[], help="hanging: only these methods")
+    parser.add_argument("--pictures", default="t_*_c__*.png", help="twisted: file pattern of images")
     options = parser.parse_args()
     cad = (options.cad or options.folder / "cad") / "cantilever_f1494_v749.obj"
     options.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Quick masks for tests of the page: boxes are filled, in all frames alike."""
+"""Quick masks for tests of the page: filled boxes, the same in all frames."""
 
 from threading import Event
 

@@ -56,7 +56,7 @@ class Client:
         return status, json.loads(content)
 
     def wait(self, condition, seconds=30.0):
-        """What a condition gives once it is true."""
+        """Value of a condition once it is true."""
         end = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < end, "it did not happen"

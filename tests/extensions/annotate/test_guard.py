@@ -1,4 +1,4 @@
-"""Who is answered: hostile requests get a refusal and nothing else."""
+"""Hostile requests are refused without any data."""
 
 import json
 import socket

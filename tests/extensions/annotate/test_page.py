@@ -13,14 +13,14 @@ CONTROL, SHIFT = 2, 8
 
 
 class Page:
-    """What a user does on the page."""
+    """Actions of a user on the page."""
 
     def __init__(self, browser, client):
         self.browser, self.client = browser, client
         show(browser, client)
 
     def at(self, *point):
-        """Where a pixel of the frame is in the window."""
+        """Position of a pixel of the frame in the window."""
         return tuple(self.browser.run(f"annotate.view.toWindow({[float(value) for value in point]})"))
 
     def drag(self, *points):

@@ -1,4 +1,4 @@
-"""Requests of the page: marks and masks that are never lost, and never written over by a stale tab."""
+"""Requests of the page: annotations and masks are never lost or overwritten by a stale tab."""
 
 import json
 

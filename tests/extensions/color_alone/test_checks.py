@@ -1,4 +1,4 @@
-"""What one picture cannot say of a body is stated."""
+"""Checks state which properties of an object one image does not determine."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Frame 0 without depth: what lies on the table, and what hands hide."""
+"""Frame 0 without depth: objects on the table, and areas that hands hide."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -128,7 +128,7 @@ def test_a_box_that_stands_rises_from_where_it_touches_the_table(pose):
 
 @pytest.mark.parametrize(("x", "y"), [(0.3, 0.06), (0.15, 0.15)])
 def test_a_box_that_lies_keeps_its_place(x, y):
-    """Whether its pose is known or not, if it is no longer than it is wide in this view."""
+    """With or without a known pose, if the object is not longer than wide in this view."""
     for pose in (None, "lying"):
         upper, lower = sides(filled_outline(box(x, y, 0.06)), pose)
         middle = 0.5 * (upper + lower)

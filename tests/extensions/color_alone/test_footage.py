@@ -1,4 +1,4 @@
-"""Committed marks, and the masks that they give on real film, where it is: figures of perception/README.md, with a margin."""
+"""Committed annotations and their masks on real video, if present: the numbers of perception/README.md, with a margin."""
 
 from pathlib import Path
 

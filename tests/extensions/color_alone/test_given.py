@@ -1,4 +1,4 @@
-"""Hands, nodes and annotated points that a capture brings, beside film of color alone and of depth."""
+"""Controllers, nodes and annotated points of a capture with video of color only and with depth."""
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from tests.support.still import still
 ROW = ScenarioRow(scenario="painted", source="capture", category="cloth", path="painted", self_collision=False, ground=True)
 SETTINGS = Perception(sample=Sampling(voxel=0.02, nodes=60))
 NODES = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.1, 0.1, 9), [0.001], indexing="ij"), -1).reshape(-1, 3)
-"""Of the painted cloth, 25 mm apart."""
+"""Nodes of the painted cloth, 25 mm apart."""
 GRIP = np.array([[-0.01, 0.1, 0.004], [0.01, 0.1, 0.004], [0.0, 0.11, 0.01]])
 MARKED = np.array([[-0.05, -0.05, 0.0], [0.05, 0.0, 0.0], [0.0, 0.05, 0.0], [0.05, 0.05, 0.0]])
 

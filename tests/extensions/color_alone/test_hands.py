@@ -1,4 +1,4 @@
-"""Hands in the image and in space, and what is read of future frames."""
+"""Hands in the image and in space, and which future frames are read."""
 
 from dataclasses import replace
 
@@ -151,7 +151,7 @@ def test_sheets_alone_are_held_by_fingers_alone(tmp_path, monkeypatch, category,
 
 
 def seen_on(path):
-    """What a camera sees of one hand of four points that goes along `path` [T, 3], m, without turning."""
+    """Images of one hand of four points that moves along `path` [T, 3], m, without rotation."""
     view, frames = camera(path[0]), len(path)
     return replace(
         colored.observed().image,

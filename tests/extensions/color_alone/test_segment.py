@@ -1,4 +1,4 @@
-"""Marks carried through films whose masks are known."""
+"""Annotations propagated through videos with known masks."""
 
 import cv2
 import numpy as np

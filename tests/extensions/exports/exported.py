@@ -108,7 +108,7 @@ def run_folder(
 
 
 def described(folder):
-    """What the description of exported arrays says, the arrays, and the sizes by their symbols; every shape is as described."""
+    """Description of exported arrays, the arrays, and sizes by symbol; asserts that every shape is as described."""
     said = json.loads((folder / npz.DESCRIPTION_FILE).read_text())
     with np.load(folder / npz.ARRAYS_FILE, allow_pickle=False) as file:
         arrays = dict(file)

@@ -1,4 +1,4 @@
-"""What can be exported, and what is said about what cannot."""
+"""Exportable runs, and the errors for all others."""
 
 import json
 import shutil
@@ -61,7 +61,7 @@ def weighed(mass=TOTAL):
 
 @pytest.mark.parametrize(("known", "given"), [(TOTAL, []), (None, ["--mass", str(TOTAL)]), (5.0, ["--mass", str(TOTAL)])])
 def test_every_format_holds_the_mass_of_the_capture_or_the_given_one(tmp_path, capsys, known, given):
-    """What is given goes before what the capture says."""
+    """Options have priority over the capture."""
     mujoco = pytest.importorskip("mujoco", reason="mujoco-core is not installed (extra `export`)")
     usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (extra `export`)")
     folder, out = exported.run_folder(tmp_path / "results", with_splats=False, change=weighed(known)), tmp_path / "out"

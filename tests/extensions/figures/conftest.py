@@ -1,4 +1,4 @@
-"""Results that figures are drawn of, made once for all of these tests, which only read them."""
+"""Results for figures, made once; tests only read them."""
 
 import pytest
 from matplotlib import pyplot as plt

@@ -14,7 +14,7 @@ from tests.support.shown import painter
 ALL = range(8)
 RATE = 30.0
 COLOR_DIFFERENCE = 12
-"""Of 255, what H.264 changes in a plain area."""
+"""Change by H.264 in a uniform area, of 255."""
 
 
 def gif(path) -> tuple[list[np.ndarray], list[int], int]:

@@ -1,4 +1,4 @@
-"""Strangers' packages, that of the page of extensions among them, are installed: help, jobs, tables and report have them."""
+"""Installed packages of users, including the example of the extensions page: help, jobs, tables and report contain them."""
 
 import json
 import os

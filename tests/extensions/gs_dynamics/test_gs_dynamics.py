@@ -254,7 +254,7 @@ def corners(count, seed):
 
 
 def capture(points, tools, train_end=None):
-    """Of points [T, N, 3] that are always seen and two nodes more."""
+    """Observations of points [T, N, 3] that are always visible, and two more nodes."""
     about = {"category": "sloth", "train_end": train_end or len(points)}
     return scenarios.seen(points, tools, about, surface_points=corners(1, 8), interior_points=corners(1, 9))
 
@@ -294,7 +294,7 @@ def one_step(model, points, tools, frame):
 
 @torch.no_grad()
 def taught(frames, count=20):
-    """What a network of known random weights makes of a cloud: points [T, N, 3] and tools [T, C, 3], m.
+    """Output of a network with known random weights for a cloud: points [T, N, 3] and tools [T, C, 3], m.
 
     Its head is set so that the first displacements are 5 mm, and 0 on average.
     """

@@ -88,7 +88,7 @@ WIDE = np.array([[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1.0]])
 
 
 def board_image(pose):
-    """What a camera sees of a board that lies on z = 0, its corner at the origin, its rows along x, its columns along minus y."""
+    """Image of a board on z = 0, its corner at the origin, its rows along x, its columns along minus y."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     print_ = cv2.aruco.CharucoBoard((5, 7), 0.04, 0.03, dictionary).generateImage((500, 700))
     to_world = np.array([[0.0004, 0, 0.0002], [0, -0.0004, -0.0002], [0, 0, 1]])

@@ -18,7 +18,7 @@ NOTE = "note: hands within 5 cm: 0-2: 1, 3-4: 2: neuspring cut-capture x --frame
 
 
 class Steps:
-    """In the place of processes: what was run, and files as the commands leave them."""
+    """Replaces processes: records the commands and writes their files."""
 
     def __init__(self):
         self.ran: list[list[str]] = []

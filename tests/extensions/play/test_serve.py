@@ -1,4 +1,4 @@
-"""Whom the server answers: this machine's own pages, at the port that was asked for."""
+"""The server answers only pages of this machine, at the requested port."""
 
 import http.client
 import socket

@@ -1,4 +1,4 @@
-"""A twin that is pulled, who holds it, and the time of a recording."""
+"""A pulled twin, its controllers, and the time of a recording."""
 
 from dataclasses import replace
 

@@ -185,7 +185,7 @@ def test_parts_arrive_where_the_reader_looks_and_complete_files_stay(hub, releas
     changed.write_bytes(changed.read_bytes()[:-1])
     capsys.readouterr()
     fetch.fetch(target, [NAME], ["results"])
-    assert "experiments.zip: 2 files, 1 of them to fetch" in capsys.readouterr().out
+    assert "experiments.zip: 2 files; 1 are missing" in capsys.readouterr().out
     assert changed.read_bytes() == expected[changed.relative_to(target).as_posix()]
 
 

@@ -60,7 +60,7 @@ def column(segments: int, load: float, stretching: float = 1e7) -> Rod:
 
 
 def buckling_load(segments: int) -> float:
-    """Of `column`, N: 4 EI / h^2 sin^2(pi / (2 N)) exactly, Euler's pi^2 EI / L^2 for N segments without end."""
+    """Buckling load of `column`, N: 4 EI / h^2 sin^2(pi / (2 N)) exactly, Euler's pi^2 EI / L^2 for N segments without end."""
     return float(4 * segments**2 * np.sin(np.pi / 2 / segments) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""A rod answers what every body must, and loads from files."""
+"""A rod implements the interface of bodies, and loads from files."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What rods refuse: the exception and the field that it names."""
+"""Errors of rods: the exception and the field that it names."""
 
 from dataclasses import replace
 
@@ -48,13 +48,13 @@ def along():
 @pytest.mark.parametrize(
     ("call", "error", "field"),
     [
-        (lambda: center_line(BALL, 12), InputError, "observations, nodes of frame 0: .*long and thin.*lattice"),
+        (lambda: center_line(BALL, 12), InputError, "observations, nodes of frame 0: .*one line without branches.*lattice"),
         (
             lambda: rod_twin(ropes.rope(), replace(ropes.SETTINGS, search=config.Search(variables=NOTHING)), ropes.AXIS),
             InputError,
-            r".*a hand must hold the rod.*controller_radius",
+            r".*a controller must hold the rod.*controller_radius",
         ),
-        (lambda: ropes.twin(colored.observed()), InputError, ".*tracked in space.*without depth"),
+        (lambda: ropes.twin(colored.observed()), InputError, ".*tracked in 3D.*without depth"),
         (
             lambda: search_rod(ropes.rope(), [ropes.rope()], ropes.SETTINGS),
             InputError,
@@ -62,8 +62,8 @@ def along():
         ),
         (lambda: move(ropes.twin(CABLE), DOUBLE), InputError, "transfer to .*as long as the twin's"),
         (lambda: move(ropes.twin(CABLE), ropes.rope()), InputError, "transfer to .*line of 7 vertices.*no line"),
-        (crossed, InputError, r"twin\.body: .*ground alone"),
-        (continued, InputError, r"twin\.body: .*begins in frame 0"),
+        (crossed, InputError, r"twin\.body: .*must not collide"),
+        (continued, InputError, r"twin\.body: .*must start in frame 0"),
         (along, InputError, r"rod\.axis: .*cosine below"),
         (lambda: make.rod(make.straight(4), (0, 1), slip=np.array([[-0.1, 0.3]])), InputError, r"rod\.slip"),
         (lambda: make.rod(make.straight(4), (0, 1), slip=np.array([[0.1, 0.2, 0.3]])), InputError, r"rod\.slip"),

@@ -1,4 +1,4 @@
-"""A rod in other tools: it hangs in MuJoCo as here, viewers show the center line, and no reader takes it for springs alone."""
+"""A rod in other tools: it hangs in MuJoCo as here, viewers show the center line, and no reader treats it as springs."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from tests.extensions.rods import ropes
 from tests.extensions.rods.ropes import rod_results
 
 HANGING = 0.03
-"""Of the sag: MuJoCo's edges are rigid bodies with a mass along them, ours have it at their ends, and clamps are soft there.
+"""Tolerance of the sag: MuJoCo's edges are rigid bodies with distributed mass, ours have it at their ends; its clamps are soft.
 Measured: 0.021; in Newton, of the largest motion, 0.007 to 0.018."""
 
 

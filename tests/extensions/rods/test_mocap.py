@@ -110,7 +110,7 @@ def test_whole_recordings_may_be_for_training_and_short_ones_are_refused(tmp_pat
         (recording(count=5), r"at least 6 markers.*5"),
         ((recording() * 1000).astype(int), r"dtype must be floating point.*int"),
         (recording()[:3], r"at least 4 frames.*3"),
-        (np.where(np.arange(12) == 3, np.nan, recording()), r"finite.*nan at frame 0, marker 3 \(120 in all\)"),
+        (np.where(np.arange(12) == 3, np.nan, recording()), r"finite.*nan at frame 0, marker 3 \(120 in total\)"),
         ([[1.0, 2.0], [3.0]], r"different lengths"),
         ({"positions": 1}, r"required; received dict"),
         (recording()[:, :, [0, 1, 2, 2, 4, 5, 6, 7]], r"markers 2 and 3"),

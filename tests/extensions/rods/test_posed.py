@@ -84,12 +84,12 @@ def test_angles_stride_and_gaps_of_markers(tmp_path):
 @pytest.mark.parametrize(
     ("change", "settings", "message"),
     [
-        (lambda rows: rows.drop(columns="qz"), {}, r"none of qz.*section posed"),
-        (lambda rows: rows.assign(qw=2.0), {}, r"quaternions have length 1.*posed\.angles"),
-        (lambda rows: rows.drop(index=7), {}, r"evenly.*Resample"),
+        (lambda rows: rows.drop(columns="qz"), {}, r"no qz.*section posed"),
+        (lambda rows: rows.assign(qw=2.0), {}, r"quaternions must have length 1.*posed\.angles"),
+        (lambda rows: rows.drop(index=7), {}, r"time steps must be equal.*Resample"),
         (lambda rows: rows.assign(x=np.nan), {}, r"x: every entry must be a number"),
-        (lambda rows: rows.assign(end_x=rows["end_x"].where(rows.index > 0)), {}, r"marker 1 is not.*Begin the table"),
-        (lambda rows: rows, {"unloaded": UNLOADED[:1]}, r"as many places as markers.*1 and 2"),
+        (lambda rows: rows.assign(end_x=rows["end_x"].where(rows.index > 0)), {}, r"no marker 1.*Start the table"),
+        (lambda rows: rows, {"unloaded": UNLOADED[:1]}, r"one unloaded position per marker.*1 and 2"),
         (lambda rows: rows, {"angles": "ZYX"}, r"posed\.rotation.*four columns"),
         (lambda rows: rows, {"stride": 20}, r"at least 5 samples"),
     ],

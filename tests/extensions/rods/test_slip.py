@@ -30,7 +30,7 @@ def started(rods: list[Rod], v: Any = 0.0, **changes: Any) -> RodSolver:
 
 
 def rolled(body: Rod, hands: np.ndarray, v: Any = 0.0, **changes: Any) -> torch.Tensor:
-    """Vertices [V, 3] at the end of the hands' path [T, V, 3], or [T, 1, 3] of all alike, from where they are."""
+    """Vertices [V, 3] at the end of the path of controllers, [T, V, 3] or [T, 1, 3] for all, from the present state."""
     solver = started([body], v, **changes)
     for begin, end in pairwise(make.real(hands)[:, None] + solver.x):
         solver.frame(begin, end)

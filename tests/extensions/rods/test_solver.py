@@ -144,7 +144,7 @@ def test_a_column_swings_below_its_buckling_load_and_grows_above():
 
 
 def test_twist_makes_a_straight_rod_unstable():
-    """Of Greenhill's moment, 1.035 times with eight segments."""
+    """The critical moment is Greenhill's, times 1.035 with eight segments."""
     rods = [make.twisted(8, share * 1.035 * make.GREENHILL) for share in (0.9, 1.1)]
     nudge = 1e-3 * np.sin(np.pi * rods[0].vertices[:, 0])
     x = still(rods, 25, make.real(np.outer(nudge, [0, 0, 1])), frame_time=0.02)

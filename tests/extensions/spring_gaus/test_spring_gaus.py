@@ -206,7 +206,7 @@ def test_anchors_lie_in_different_cells_of_the_coarsest_grid_that_has_enough():
     assert len(np.unique(choose_anchors(points, 500, np.random.default_rng(1)), axis=0)) == 500
     # There are no more cells than points.
     assert len(choose_anchors(points[:10], 50, np.random.default_rng(1))) <= 10
-    with pytest.raises(NumericalFailure, match=r"more anchors than neighbors \(20\) are required, and there are 3"):
+    with pytest.raises(NumericalFailure, match=r"more anchors than neighbors \(20\) are required; received 3"):
         AnchorGraph.between(bar()[:3], np.zeros((1, 3)), 20)
 
 
@@ -244,7 +244,7 @@ def test_a_frame_that_fails_gets_more_substeps_and_training_never_ends_silently(
     settings = replace(SMALL, iterations=2, substeps=10, max_substeps=160)
     trained = run(Problem(replace(start, substeps=10), hands, pull_in, settings))
     assert not trained.failure and trained.model.substeps == 160
-    assert "160 substeps from here on" in capsys.readouterr().out
+    assert "160 substeps from now on" in capsys.readouterr().out
     stiff = replace(start, kappa=np.full(72, 7.0), substeps=10)
     failed = run(Problem(stiff, hands, pull_in, settings))
     assert failed.failure == "training ended early: the anchors left the scene (iteration 0, frame 1, 160 substeps)"

@@ -1,4 +1,4 @@
-"""A synthetic capture, its truth, perfect perception of it, and the judge that tells perfect from spoilt."""
+"""A synthetic capture, its truth, and the stage that separates perfect from faulty perception."""
 
 import shutil
 from dataclasses import replace

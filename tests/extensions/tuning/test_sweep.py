@@ -1,4 +1,4 @@
-"""Sweeps: what they refuse, their trials, workers that are killed, the report."""
+"""Sweeps: errors, trials, killed workers, the report."""
 
 import dataclasses
 import json
@@ -96,13 +96,13 @@ def finished(tmp_path_factory):
         ({"fit.learning_rat": RANGE}, "learning_rat.*did you mean.*learning_rate"),
         ({"toy.frames": RANGE}, "must begin with simulation"),
         ({"fit.field": RANGE}, "not a section"),
-        ({"fit.horizon.more": RANGE}, "a part of a setting"),
+        ({"fit.horizon.more": RANGE}, "an item of a setting"),
         ({"fit.horizon": {"low": 1, "high": 2.5}}, "fit.horizon = 2.5"),
         ({"clusters": {"low": 0, "high": 2}}, "at least 1"),
         ({"fit.damping": {"choices": ["fixed", "springs"]}}, "fit.damping = 'springs'"),
         ({"fit.learning_rate": {"low": -1.0, "high": 1.0}}, "fit.learning_rate = -1.0"),
         ({"fit.learning_rate": {"low": 0.1, "high": 1.0}}, "must include that of the method, 0.0001"),
-        ({"fit.field.shuffled": {"choices": [True, False]}}, "does not read it"),
+        ({"fit.field.shuffled": {"choices": [True, False]}}, "must be a setting that method .* reads"),
         ({"fit.selection": {"choices": ["tail", "training_loss"]}}, "same in all trials"),
         ({"losses.chamfer": RANGE}, "same in all trials"),
         ({"fit.stiffness_range": {"choices": [[0.0, 1e5], [0.0, 2e5]]}}, "choices must be numbers"),
@@ -124,18 +124,18 @@ def test_what_a_sweep_cannot_go_on_with_is_refused(finished, tmp_path):
     folder, tune = finished
     with pytest.raises(InputError, match="must not contain a password"):
         sweep(storage="postgresql://me:secret@host:5432/studies")
-    with pytest.raises(InputError, match="does not read it"):
+    with pytest.raises(InputError, match=r"must be a setting that method .* reads"):
         Plan.of(settings(), sweep(method="search_only"), folder.parent)
     for method in ("oracle_neuspring", "nothing"):
-        with pytest.raises(InputError, match="fitted by gradients and is no oracle"):
+        with pytest.raises(InputError, match="a gradient fit, and not an oracle"):
             Plan.of(config.Config(), sweep(method=method), ROOT)
     with pytest.raises(InputError, match="another base"):
         work(folder, tune, settings(fit={"epochs": 4}))
-    with pytest.raises(InputError, match="those of other are required"):
+    with pytest.raises(InputError, match="must be those of other"):
         work(folder, tune, settings(scenarios=["other"]))
     with pytest.raises(InputError, match=r"0 to tune\.workers - 1 = 0"):
         work(folder, tune, number=1)
-    with pytest.raises(InputError, match="must have been begun"):
+    with pytest.raises(InputError, match="must have begun"):
         report(settings(), tune, tmp_path / "summary.md", folder.parent)
 
 

@@ -100,5 +100,5 @@ def mjcf(source: ExportSource) -> str:
 export = Export(
     write=write,
     name="{name}_mujoco",
-    then="Next: copy run.py from MuJoCo in neuspring/extensions/exports/README.md, then .venv/bin/python run.py {output}",
+    then="Next: save the MuJoCo script of neuspring/extensions/exports/README.md as run.py; .venv/bin/python run.py {output}",
 )

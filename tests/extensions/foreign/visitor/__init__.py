@@ -1,4 +1,4 @@
-"""One member of each of several kinds, as small as they can be. What computes is imported where it is used."""
+"""One minimal member of each kind. Modules that compute are imported where they are used."""
 
 from __future__ import annotations
 
