@@ -222,7 +222,7 @@ def test_deforms_benchmark_is_a_pool_of_evenly_spaced_recordings_per_cable(tmp_p
         made(cables=["DLO8"], clips=4)
     with pytest.raises(InputError, match=r"DLO9: at least 2 recordings.*received 0 and 0"):
         made(cables=["DLO9"], clips=2)
-    with pytest.raises(InputError, match="configuration, deform: DEFORM's data need data_root"):
+    with pytest.raises(InputError, match="configuration, deform: DEFORM's data require data_root"):
         pooled(tmp_path, **tables, deform={"cables": ["DLO7"]})
 
 
