@@ -48,7 +48,7 @@ def test_color_alone_becomes_scores_of_pictures_and_marked_points(project, tmp_p
     assert scores.set_index("metric").loc["image_error", "value"] < 5
     assert (folder / "perception" / "hands.png").exists()
     summaries = [path.read_text() for path in project.rglob("summary.md")]
-    assert any("Points marked in images" in text for text in summaries)
+    assert any("Errors of annotated points" in text for text in summaries)
 
 
 @pytest.mark.slow
